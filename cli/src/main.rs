@@ -1,0 +1,3 @@
+//! `rayherd`: renders, prepares, compares, replays.
+
+fn main() {}

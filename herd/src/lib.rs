@@ -1,0 +1,3 @@
+//! Rays in motion: stores, wire formats, planning, rounds, the local run.
+
+pub mod store;

@@ -1,0 +1,89 @@
+//! Where blocks, ray groups and film parts live: one trait, several backends, layers around them.
+
+use async_trait::async_trait;
+use bytes::Bytes;
+
+/// A flat space of named, immutable objects.
+///
+/// A `put` is atomic: readers see the whole object or none. Keys are `/`-separated, of `[A-Za-z0-9._-]`, never empty,
+/// never with `..`. Putting a key again replaces it (content-addressed keys make that harmless).
+#[async_trait]
+pub trait BlockStore: Send + Sync {
+    /// Stores an object.
+    async fn put(&self, key: &str, body: Bytes) -> Result<(), StoreError>;
+    /// Reads a whole object.
+    async fn get(&self, key: &str) -> Result<Bytes, StoreError>;
+    /// Size of an object in bytes, `None` when there is none.
+    async fn size(&self, key: &str) -> Result<Option<u64>, StoreError>;
+    /// Keys with the prefix, ascending, with sizes.
+    async fn list(&self, prefix: &str) -> Result<Vec<(String, u64)>, StoreError>;
+    /// Deletes objects; those that are not there are no error.
+    async fn delete(&self, keys: &[String]) -> Result<(), StoreError>;
+    /// Where this is, for messages: `s3://bucket/prefix`, a folder, `memory`.
+    fn describe(&self) -> String;
+}
+
+/// Why a store did not do it, named by what the caller can do.
+#[derive(Debug, thiserror::Error)]
+pub enum StoreError {
+    /// There is no such object: rebuild it or give up.
+    #[error("{store}: no object {key}")]
+    NotFound {
+        /// Which store.
+        store: String,
+        /// Which object.
+        key: String,
+    },
+    /// Not allowed: check credentials, bucket, permissions.
+    #[error("{store}: {action} {key} refused: {message}")]
+    Denied {
+        /// Which store.
+        store: String,
+        /// What was tried.
+        action: &'static str,
+        /// On which object.
+        key: String,
+        /// What the store said.
+        message: String,
+    },
+    /// May work later: try again.
+    #[error("{store}: {action} {key} failed for now: {message}")]
+    Unavailable {
+        /// Which store.
+        store: String,
+        /// What was tried.
+        action: &'static str,
+        /// On which object.
+        key: String,
+        /// What happened.
+        message: String,
+    },
+    /// No room: free some.
+    #[error("{store}: no room for {key} ({bytes} bytes)")]
+    Full {
+        /// Which store.
+        store: String,
+        /// Which object.
+        key: String,
+        /// Its size.
+        bytes: u64,
+    },
+    /// What was read is not what was written: read another copy, or rebuild it.
+    #[error("{store}: {key} is corrupt: {message}")]
+    Corrupt {
+        /// Which store.
+        store: String,
+        /// Which object.
+        key: String,
+        /// What does not match.
+        message: String,
+    },
+    /// The key breaks the rules.
+    #[error("{key:?} is no valid key: {message}")]
+    InvalidKey {
+        /// The key.
+        key: String,
+        /// Which rule.
+        message: String,
+    },
+}

@@ -1,0 +1,1 @@
+//! Trees over triangles and spheres: building, storing, checking, tracing.

@@ -1,0 +1,159 @@
+//! The format-free scene: what every importer yields and all that preparing knows.
+
+use std::path::PathBuf;
+
+pub use rayherd_render::filter::Filter;
+pub use rayherd_render::material::{Bsdf, Distribution, Material};
+use serde::{Deserialize, Serialize};
+
+/// Where in a source file something stands, for messages.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Place {
+    /// The file.
+    pub file: PathBuf,
+    /// Line from 1; 0 when the file has no lines.
+    pub line: u32,
+}
+
+/// An affine map, rows of a 3 x 4 matrix: `p' = m[..][0..3] p + m[..][3]`.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Affine(pub [[f64; 4]; 3]);
+
+impl Affine {
+    /// The map that changes nothing.
+    pub const IDENTITY: Affine = Affine([[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]]);
+
+    /// Image of a point.
+    pub fn point(&self, p: [f64; 3]) -> [f64; 3] {
+        std::array::from_fn(|r| self.0[r][0] * p[0] + self.0[r][1] * p[1] + self.0[r][2] * p[2] + self.0[r][3])
+    }
+    /// Image of a direction (no translation).
+    pub fn vector(&self, p: [f64; 3]) -> [f64; 3] {
+        std::array::from_fn(|r| self.0[r][0] * p[0] + self.0[r][1] * p[1] + self.0[r][2] * p[2])
+    }
+    /// `self` after `first`.
+    pub fn after(&self, first: &Affine) -> Affine {
+        Affine(std::array::from_fn(|r| {
+            std::array::from_fn(|c| {
+                let s = (0..3).map(|k| self.0[r][k] * first.0[k][c]).sum::<f64>();
+                if c == 3 { s + self.0[r][3] } else { s }
+            })
+        }))
+    }
+    /// Determinant of the linear part; negative for a mirroring map.
+    pub fn determinant(&self) -> f64 {
+        let m = &self.0;
+        m[0][0] * (m[1][1] * m[2][2] - m[1][2] * m[2][1]) - m[0][1] * (m[1][0] * m[2][2] - m[1][2] * m[2][0])
+            + m[0][2] * (m[1][0] * m[2][1] - m[1][1] * m[2][0])
+    }
+}
+
+/// How one shape's geometry is had.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub enum Geometry {
+    /// A mesh file; `format` is decided by the importer.
+    MeshFile {
+        /// The file.
+        path: PathBuf,
+        /// Its format.
+        format: MeshFormat,
+    },
+    /// Triangles given in the description itself (rectangle, cube). Positions in object space.
+    Inline {
+        /// Vertices.
+        positions: Vec<[f64; 3]>,
+        /// Triangles, counter-clockwise from the front.
+        triangles: Vec<[u32; 3]>,
+    },
+    /// An exact sphere in object space (the transform must be a similarity).
+    Sphere {
+        /// Centre.
+        center: [f64; 3],
+        /// Radius, above 0.
+        radius: f64,
+    },
+    /// The surface where a volume passes through a value, by marching cubes.
+    IsoSurface {
+        /// DICOM folder, NRRD/NHDR or NIfTI file.
+        path: PathBuf,
+        /// The value, in the volume's rescaled units (HU for CT).
+        iso: f64,
+    },
+}
+
+/// Mesh file formats.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub enum MeshFormat {
+    /// Stanford PLY: ascii, little or big endian, polygons fanned.
+    Ply,
+    /// Wavefront OBJ, polygons fanned.
+    Obj,
+    /// STL, ascii or binary.
+    Stl,
+}
+
+/// One shape: geometry, place, look, light.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Shape {
+    /// Name in the source (id or file name), for reports.
+    pub name: String,
+    /// Where the source defines it.
+    pub place: Place,
+    /// Its geometry.
+    pub geometry: Geometry,
+    /// Object space to world space.
+    pub to_world: Affine,
+    /// Index into [`Description::materials`].
+    pub material: u32,
+    /// Radiance emitted from the front side (W/sr/m2, linear RGB), if any.
+    pub emission: Option<[f32; 3]>,
+    /// Front and back exchanged.
+    pub flip_normals: bool,
+    /// Shading normals of the file are not used.
+    pub face_normals: bool,
+}
+
+/// A perspective camera in world space.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Camera {
+    /// Camera to world: the camera looks along +z, +y is up, and +x is to the LEFT of the image (Mitsuba's convention).
+    pub to_world: Affine,
+    /// Full field of view along x, degrees, in (0, 180).
+    pub fov_x: f64,
+}
+
+/// Everything that a source says.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Description {
+    /// In source order: the order of records.
+    pub shapes: Vec<Shape>,
+    /// What shapes refer to.
+    pub materials: Vec<Material>,
+    /// Radiance of a constant sky, if any.
+    pub environment: Option<[f32; 3]>,
+    /// The camera, if the source has one.
+    pub camera: Option<Camera>,
+    /// Width and height in pixels, if given.
+    pub size: Option<[u32; 2]>,
+    /// Pixel filter, if given.
+    pub filter: Option<Filter>,
+    /// Samples per pixel, if given.
+    pub spp: Option<u32>,
+    /// Largest number of rays in a path but the shadow rays (Mitsuba's max_depth; 1 sees emitters only), if bounded.
+    pub max_depth: Option<u32>,
+    /// Vertex from which Russian roulette starts, if given.
+    pub rr_depth: Option<u32>,
+    /// What was replaced by a stand-in on request, for log and report.
+    pub substitutions: Vec<Substitution>,
+}
+
+/// Something unsupported that was replaced on request (`--substitute`).
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Substitution {
+    /// Where it stands.
+    pub place: Place,
+    /// What it is, as the source calls it.
+    pub what: String,
+    /// What stands in.
+    pub stand_in: String,
+}

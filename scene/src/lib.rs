@@ -1,0 +1,46 @@
+//! From files to a prepared scene: importing, cutting into splits, the scheduling grid, overlap reduction, manifest.
+
+pub mod description;
+pub mod record;
+
+use std::path::PathBuf;
+
+use description::Place;
+
+/// Why a source could not be read. The message says file, place and what to do.
+#[derive(Debug, thiserror::Error)]
+pub enum ImportError {
+    /// The operating system refused.
+    #[error("cannot read {}: {source}", path.display())]
+    Io {
+        /// The file.
+        path: PathBuf,
+        /// Why.
+        source: std::io::Error,
+    },
+    /// The content is not what the format says.
+    #[error("{file}:{line}: {message}", file = place.file.display(), line = place.line)]
+    Malformed {
+        /// Where.
+        place: Place,
+        /// What is wrong, and what to do.
+        message: String,
+    },
+    /// Elements that are not supported, all of them.
+    #[error("{} unsupported element(s):\n{}", .0.len(), list(.0))]
+    Unsupported(Vec<(Place, String)>),
+    /// A limit was passed before memory was taken.
+    #[error("{file}: {message}", file = path.display())]
+    Limit {
+        /// The file.
+        path: PathBuf,
+        /// Which limit, and how to raise it.
+        message: String,
+    },
+}
+
+fn list(elements: &[(Place, String)]) -> String {
+    let rows: Vec<String> =
+        elements.iter().map(|(p, what)| format!("  {}:{}: {what}", p.file.display(), p.line)).collect();
+    rows.join("\n")
+}
