@@ -1,0 +1,91 @@
+"""Median of the CPU ratio rayherd / Mitsuba over interleaved pairs, with its 95 % interval (order statistics)."""
+import argparse
+import csv
+import datetime
+import os
+import platform
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+
+import scenes
+
+SPP = {"cornell": 1024, "gyroid": 256, "veach-mis": 256}
+
+MITSUBA = """
+import sys, mitsuba as mi
+mi.set_variant('llvm_ad_rgb')
+import drjit as dr
+xml, spp, seed, depth = sys.argv[1], int(sys.argv[2]), int(sys.argv[3]), int(sys.argv[4])
+size = dict(kv.split('=') for kv in sys.argv[5:])
+scene = mi.load_file(xml, max_depth=depth, **size)
+dr.eval(mi.render(scene, spp=spp, seed=seed))
+dr.sync_thread()
+"""
+
+
+def cpu(command: list) -> tuple:
+    """CPU seconds (user + system, all threads) and wall seconds of a whole process."""
+    start = datetime.datetime.now()
+    child = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
+    error = child.stderr.read()
+    _, status, usage = os.wait4(child.pid, 0)
+    child.returncode = os.waitstatus_to_exitcode(status)
+    if child.returncode:
+        raise SystemExit(f"{' '.join(map(str, command))}\n{error.decode()}")
+    return usage.ru_utime + usage.ru_stime, (datetime.datetime.now() - start).total_seconds()
+
+
+def interval(ratios: list) -> tuple:
+    """Order statistics that hold the median with at least 95 % (binomial)."""
+    r = sorted(ratios)
+    n = len(r)
+    tail, k, p = 0.0, 0, 0.5 ** n
+    while k < n // 2 and tail + p <= 0.025:
+        tail += p
+        k += 1
+        p = p * (n - k + 1) / k
+    return r[max(k - 1, 0)], r[min(n - k, n - 1)]
+
+
+def main() -> None:
+    p = argparse.ArgumentParser(description=__doc__)
+    p.add_argument("names", nargs="*", default=["cornell", "gyroid"])
+    p.add_argument("--rayherd", required=True)
+    p.add_argument("--shared", type=Path, required=True)
+    p.add_argument("--work", type=Path, required=True)
+    p.add_argument("--results", type=Path, required=True)
+    p.add_argument("--pairs", type=int, default=10)
+    p.add_argument("--size", type=int, default=256)
+    p.add_argument("--max-depth", type=int, default=8)
+    a = p.parse_args()
+    a.work.mkdir(parents=True, exist_ok=True)
+    machine = next((l.split(":")[1].strip() for l in open("/proc/cpuinfo") if l.startswith("model name")), platform.machine())
+    out = a.results / f"{datetime.date.today()}-{machine.replace(' ', '-')}-speed.csv"
+    rows = []
+    for name in a.names:
+        xml = scenes.prepare(name, a.shared.resolve(), a.work.resolve())
+        size = scenes.size_arguments(name, a.size)
+        spp = SPP[name]
+        ours = [a.rayherd, "render", str(xml), "--size", f"{a.size}x{a.size}", "--spp", str(spp), "--max-depth", str(a.max_depth),
+                "-o", str(a.work / "bench.exr")]
+        theirs = [sys.executable, "-c", MITSUBA, str(xml), str(spp), "1", str(a.max_depth)] + [f"{k}={v}" for k, v in size.items()]
+        cpu(theirs)  # fills Mitsuba's kernel cache
+        for i in range(a.pairs):
+            (co, wo), (ct, wt) = cpu(ours), cpu(theirs)
+            rows.append([name, spp, i, co, wo, ct, wt, co / ct])
+            print(f"{name} pair {i}: rayherd {co:.2f} CPU-s, mitsuba {ct:.2f} CPU-s, ratio {co / ct:.3f}", flush=True)
+        ratios = [r[7] for r in rows if r[0] == name]
+        lo, hi = interval(ratios)
+        print(f"{name} {spp} spp: median ratio {np.median(ratios):.3f}, 95 % interval {lo:.3f} to {hi:.3f}", flush=True)
+    with open(out, "w", newline="") as f:
+        w = csv.writer(f)
+        w.writerow(["scene", "spp", "pair", "rayherd_cpu_s", "rayherd_wall_s", "mitsuba_cpu_s", "mitsuba_wall_s", "cpu_ratio"])
+        w.writerows(rows)
+    print(f"written to {out}")
+
+
+if __name__ == "__main__":
+    main()

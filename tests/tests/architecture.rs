@@ -1,0 +1,128 @@
+//! The invariants of docs/architecture.md that a program can check: what is absent, and where.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+fn top() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).parent().expect("the workspace holds this package").to_path_buf()
+}
+
+/// Every Rust file below a folder of the workspace, by its path from the top.
+fn sources(folder: &str) -> Vec<(String, String)> {
+    let top = top();
+    let mut found = Vec::new();
+    let mut folders = vec![top.join(folder)];
+    while let Some(folder) = folders.pop() {
+        for entry in fs::read_dir(&folder).unwrap_or_else(|e| panic!("{}: {e}", folder.display())) {
+            let path = entry.expect("a readable folder").path();
+            if path.is_dir() {
+                folders.push(path);
+            } else if path.extension().is_some_and(|e| e == "rs") {
+                let text = fs::read_to_string(&path).expect("readable source");
+                let relative = path.strip_prefix(&top).expect("below the top").to_string_lossy().to_string();
+                found.push((relative, text));
+            }
+        }
+    }
+    assert!(!found.is_empty(), "no sources in {folder}: has it moved?");
+    found
+}
+
+/// Lines of code (no comment lines) that contain one of the words.
+fn offending(files: &[(String, String)], words: &[&str]) -> Vec<String> {
+    let mut found = Vec::new();
+    for (path, text) in files {
+        for (number, line) in text.lines().enumerate() {
+            if line.trim_start().starts_with("//") {
+                continue;
+            }
+            if let Some(word) = words.iter().find(|w| line.contains(**w)) {
+                found.push(format!("{path}:{}: {word}", number + 1));
+            }
+        }
+    }
+    found
+}
+
+/// Names of the workspace's crates that a crate depends on outside its tests.
+fn dependencies(folder: &str) -> Vec<String> {
+    let text = fs::read_to_string(top().join(folder).join("Cargo.toml")).expect("a manifest");
+    let mut inside = false;
+    let mut found = Vec::new();
+    for line in text.lines() {
+        if line.starts_with('[') {
+            inside = line.trim() == "[dependencies]";
+        } else if inside && let Some(name) = line.strip_prefix("rayherd-") {
+            found.push(name.split(['.', ' ', '=']).next().unwrap_or_default().to_string());
+        }
+    }
+    found
+}
+
+#[test]
+fn dependencies_point_down() {
+    let allowed: [(&str, &[&str]); 5] = [
+        ("render", &[]),
+        ("scene", &["render"]),
+        ("api", &[]),
+        ("herd", &["render", "scene", "api"]),
+        ("cli", &["render", "scene", "api", "herd"]),
+    ];
+    for (folder, may) in allowed {
+        for name in dependencies(folder) {
+            assert!(may.contains(&name.as_str()), "{folder} must not depend on {name}");
+        }
+    }
+}
+
+#[test]
+fn render_is_pure() {
+    let words = [
+        "std::fs",
+        "std::io",
+        "std::net",
+        "std::thread",
+        "std::time",
+        "std::env",
+        "Instant::now",
+        "SystemTime",
+        "async fn",
+        ".await",
+        "tokio",
+        "rayon",
+        "println!",
+        "eprintln!",
+    ];
+    // render's tests may read the environment (how long to run) and start threads
+    let files: Vec<_> = sources("render/src")
+        .into_iter()
+        .filter(|(p, _)| !p.ends_with("tests.rs") && !p.contains("/tests/"))
+        .map(|(p, text)| (p, text.split("#[cfg(test)]\nmod ").next().unwrap_or_default().to_string()))
+        .collect();
+    assert_eq!(offending(&files, &words), Vec::<String>::new());
+}
+
+#[test]
+fn scene_knows_no_async_and_no_s3() {
+    assert_eq!(offending(&sources("scene/src"), &["async fn", ".await", "tokio", "aws_"]), Vec::<String>::new());
+}
+
+#[test]
+fn only_the_s3_store_knows_s3() {
+    let mut files = sources("herd/src");
+    files.extend(sources("cli/src"));
+    files.extend(sources("api/src"));
+    files.retain(|(p, _)| p != "herd/src/store/s3.rs" && !p.starts_with("herd/src/store/s3/"));
+    assert_eq!(offending(&files, &["aws_sdk", "aws_smithy", "aws_config"]), Vec::<String>::new());
+}
+
+#[test]
+fn unsafe_stays_in_named_modules() {
+    let named = ["render/src/bvh/arena", "render/src/bvh/trace", "render/src/bvh/sah", "scene/src/import/map"];
+    let mut files = Vec::new();
+    for folder in ["render/src", "scene/src", "api/src", "herd/src", "cli/src"] {
+        files.extend(sources(folder));
+    }
+    files.retain(|(p, _)| !named.iter().any(|n| p.starts_with(n)));
+    assert_eq!(offending(&files, &["unsafe ", "unsafe{", "allow(unsafe_code)"]), Vec::<String>::new());
+}
