@@ -1,1 +1,19 @@
 //! The `RenderJob` types, shared by the command line, the local run and the operator. Knows no client.
+//!
+//! The same YAML goes to `rayherd render -f` and to `kubectl apply -f`. Types parse ([`serde`]), describe themselves
+//! ([`schemars`]) and are checked by one pure function, [`validate`]. Numbers are `i64`, `i32` or `f64` with ranges,
+//! because an OpenAPI schema knows no unsigned types.
+
+pub mod byte_size;
+pub mod image_size;
+pub mod job;
+pub mod strategy;
+pub mod validate;
+
+pub use byte_size::ByteSize;
+pub use image_size::ImageSize;
+pub use job::{
+    API_VERSION, CameraSpec, ImageSpec, KIND, Metadata, RenderJob, RenderJobSpec, SamplingSpec, SceneSpec, WorkersSpec,
+};
+pub use strategy::Strategy;
+pub use validate::{Problem, validate};

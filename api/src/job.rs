@@ -1,0 +1,217 @@
+//! The `RenderJob`: what to render, how well, and on what.
+
+use std::collections::BTreeMap;
+
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+use crate::{ByteSize, ImageSize, Strategy};
+
+/// The group and version of [`RenderJob`].
+pub const API_VERSION: &str = "rayherd.io/v1alpha1";
+/// The kind of [`RenderJob`].
+pub const KIND: &str = "RenderJob";
+
+/// One scene, rendered from one or more cameras.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "camelCase", deny_unknown_fields)]
+pub struct RenderJob {
+    /// `rayherd.io/v1alpha1`.
+    pub api_version: String,
+    /// `RenderJob`.
+    pub kind: String,
+    /// Name and labels.
+    #[serde(default)]
+    pub metadata: Metadata,
+    /// What is wanted.
+    pub spec: RenderJobSpec,
+}
+
+/// The part of Kubernetes' object metadata that a local run has a use for; other fields are let through.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "camelCase")]
+pub struct Metadata {
+    /// Name of the job; outputs are named after it when it is given.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub name: Option<String>,
+    /// Labels.
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub labels: BTreeMap<String, String>,
+}
+
+/// What is wanted of a render. What is left out is taken from the scene file, or else from the defaults named here.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "camelCase", deny_unknown_fields)]
+pub struct RenderJobSpec {
+    /// The scene and how it is imported.
+    pub scene: SceneSpec,
+    /// The picture or pictures.
+    #[serde(default)]
+    pub image: ImageSpec,
+    /// How many paths, and how long.
+    #[serde(default)]
+    pub sampling: SamplingSpec,
+    /// How rays and scene data meet. The image is the same bytes for all of them.
+    #[serde(default)]
+    pub strategy: Strategy,
+    /// Bytes of one split of the scene, measured as stored geometry; 128Mi by default. Not together with `splits`.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub block_size: Option<ByteSize>,
+    /// Number of splits, instead of `blockSize`.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schemars(range(min = 1, max = 1_000_000))]
+    pub splits: Option<i64>,
+    /// Share of primitives in contested cells above which the scheduling grid is refined; 0.2 by default.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schemars(range(min = 0.0, max = 1.0))]
+    pub overlap_threshold: Option<f64>,
+    /// The machines: real ones on a cluster, virtual ones in a local run.
+    #[serde(default)]
+    pub workers: WorkersSpec,
+    /// Nodes that hold a copy of each block; 1 by default.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schemars(range(min = 1, max = 16))]
+    pub replicas: Option<i32>,
+    /// Whether all tasks of a round end before the next begins; by default false for `Auto`, true for the others.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub barrier: Option<bool>,
+    /// Seconds of work that a task is sized to; 10 by default.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schemars(range(min = 0.01, max = 3600.0))]
+    pub task_seconds: Option<f64>,
+}
+
+/// The scene and how it is imported.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "camelCase", deny_unknown_fields)]
+pub struct SceneSpec {
+    /// A Mitsuba XML file, a mesh (PLY, OBJ, STL), a folder of meshes, or a CT volume (DICOM folder, NRRD, NIfTI).
+    /// A relative path in a job file is relative to that file.
+    pub source: String,
+    /// Value of the surface to extract from a volume, in its rescaled units (Hounsfield for CT).
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub iso: Option<f64>,
+    /// Lights added to a mesh or volume, instead of the two that frame it, each as `--light` takes it.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub lights: Vec<String>,
+    /// Radiance of a constant sky: one number or three (linear RGB), instead of the scene's.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub sky: Option<Vec<f64>>,
+    /// Reflectance of a mesh or volume: one number or three (linear RGB) in 0 to 1.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub albedo: Option<Vec<f64>>,
+    /// Whether each unsupported element is replaced by a named stand-in instead of being an error.
+    #[serde(default)]
+    pub substitute: bool,
+    /// Values for the parameters of a Mitsuba file (`$name`).
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub parameters: BTreeMap<String, String>,
+}
+
+/// The picture or pictures.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "camelCase", deny_unknown_fields)]
+pub struct ImageSpec {
+    /// `WIDTHxHEIGHT` in pixels.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub size: Option<ImageSize>,
+    /// One frame per camera, all from one prepared scene; without any, the scene's own camera or one that frames it.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub cameras: Vec<CameraSpec>,
+    /// The EXR file; the PNG stands beside it. With several cameras `-NAME` or `-0001`.. comes before the extension.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub output: Option<String>,
+    /// Exposure of the PNG in stops; 0 by default. The EXR is not changed by it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schemars(range(min = -32.0, max = 32.0))]
+    pub exposure: Option<f64>,
+}
+
+/// A perspective camera.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "camelCase", deny_unknown_fields)]
+pub struct CameraSpec {
+    /// Name of the frame, of `[A-Za-z0-9._-]`.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub name: Option<String>,
+    /// Where it stands, in the scene's coordinates.
+    pub origin: [f64; 3],
+    /// A point that it looks at.
+    pub target: [f64; 3],
+    /// The direction that is up in the image; [0, 1, 0] by default.
+    #[serde(default = "default_up")]
+    pub up: [f64; 3],
+    /// Full field of view along the width, degrees.
+    #[schemars(range(min = 0.001, max = 179.0))]
+    pub fov: f64,
+}
+
+fn default_up() -> [f64; 3] {
+    [0.0, 1.0, 0.0]
+}
+
+/// How many paths, and how long.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "camelCase", deny_unknown_fields)]
+pub struct SamplingSpec {
+    /// Samples per pixel; with a target error or a time limit, the most that are taken.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schemars(range(min = 1, max = 16_777_216))]
+    pub spp: Option<i32>,
+    /// Relative squared error (relMSE, estimated from the two halves of the film) at which sampling stops.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schemars(range(min = 0.0))]
+    pub target_error: Option<f64>,
+    /// Most rays in a path, shadow rays not counted: 1 sees emitters only.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schemars(range(min = 1, max = 65535))]
+    pub max_depth: Option<i32>,
+    /// Vertex from which Russian roulette ends paths.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schemars(range(min = 1, max = 65535))]
+    pub rr_depth: Option<i32>,
+    /// Paths that go on from the first hit of each sample; 1 by default.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schemars(range(min = 1, max = 65535))]
+    pub split: Option<i32>,
+    /// Seed of every random number; 0 by default.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schemars(range(min = 0))]
+    pub seed: Option<i64>,
+}
+
+/// The machines.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "camelCase", deny_unknown_fields)]
+pub struct WorkersSpec {
+    /// Number of nodes; 1 by default, or as many as `slots` has numbers.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schemars(range(min = 1, max = 4096))]
+    pub nodes: Option<i32>,
+    /// Tasks at a time per node: one number for all nodes, or one for each. By default the threads of the machine.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub slots: Vec<i32>,
+    /// Memory of one node for blocks, rays and film. By default what the machine has.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub memory: Option<ByteSize>,
+}
+
+impl RenderJob {
+    /// A job of the current version with this specification.
+    pub fn new(spec: RenderJobSpec) -> Self {
+        RenderJob { api_version: API_VERSION.into(), kind: KIND.into(), metadata: Metadata::default(), spec }
+    }
+}
+
+impl WorkersSpec {
+    /// Slots of each node, `default` where none are given. `None` when the numbers contradict each other.
+    pub fn slots_per_node(&self, default: u32) -> Option<Vec<u32>> {
+        let nodes = self.nodes.map(|n| n as usize);
+        match (&self.slots[..], nodes) {
+            ([], n) => Some(vec![default; n.unwrap_or(1)]),
+            ([one], n) => Some(vec![*one as u32; n.unwrap_or(1)]),
+            (many, n) if n.is_none_or(|n| n == many.len()) => Some(many.iter().map(|&s| s as u32).collect()),
+            _ => None,
+        }
+    }
+}

@@ -1,0 +1,289 @@
+//! What a schema alone can't say, and the ranges again for those who parse without one.
+
+use std::fmt;
+
+use crate::{API_VERSION, KIND, RenderJob};
+
+/// Something wrong with a job, and what to do about it.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Problem {
+    /// Path of the field, such as `spec.sampling.spp`.
+    pub field: String,
+    /// What is wrong and the remedy.
+    pub message: String,
+}
+
+impl fmt::Display for Problem {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{}: {}", self.field, self.message)
+    }
+}
+
+/// Every problem of a job, in the order of its fields; none when it can run.
+pub fn validate(job: &RenderJob) -> Vec<Problem> {
+    let mut c = Checks(Vec::new());
+    let spec = &job.spec;
+    c.check("apiVersion", job.api_version == API_VERSION, || {
+        format!("is {:?}, but this version of rayherd reads {API_VERSION}", job.api_version)
+    });
+    c.check("kind", job.kind == KIND, || format!("is {:?}, but must be {KIND}", job.kind));
+
+    let scene = &spec.scene;
+    c.check("spec.scene.source", !scene.source.trim().is_empty(), || "is empty: name a scene file or folder".into());
+    if let Some(iso) = scene.iso {
+        c.check("spec.scene.iso", iso.is_finite(), || format!("is {iso}: give a finite value"));
+    }
+    for (field, colour, most) in [("sky", &scene.sky, f64::INFINITY), ("albedo", &scene.albedo, 1.0)] {
+        let Some(colour) = colour else { continue };
+        let field = format!("spec.scene.{field}");
+        c.check(&field, matches!(colour.len(), 1 | 3), || {
+            format!("has {} numbers: give one, or three for red, green and blue", colour.len())
+        });
+        c.check(&field, colour.iter().all(|v| v.is_finite() && (0.0..=most).contains(v)), || {
+            let upper = if most.is_finite() { format!(" to {most}") } else { " or more".into() };
+            format!("is {colour:?}: each number must be 0{upper}")
+        });
+    }
+
+    check_image(&mut c, job);
+    let sampling = &spec.sampling;
+    let integer = |v: Option<i32>| v.map(f64::from);
+    c.range("spec.sampling.spp", integer(sampling.spp), 1.0, f64::from(1 << 24));
+    if let Some(error) = sampling.target_error {
+        c.check("spec.sampling.targetError", error.is_finite() && error > 0.0, || {
+            format!("is {error}: give a relative squared error above 0, such as 0.01")
+        });
+    }
+    c.range("spec.sampling.maxDepth", integer(sampling.max_depth), 1.0, 65535.0);
+    c.range("spec.sampling.rrDepth", integer(sampling.rr_depth), 1.0, 65535.0);
+    c.range("spec.sampling.split", integer(sampling.split), 1.0, 65535.0);
+    if let Some(seed) = sampling.seed {
+        c.check("spec.sampling.seed", seed >= 0, || format!("is {seed}: give 0 or more"));
+    }
+
+    c.check("spec.blockSize", !(spec.block_size.is_some() && spec.splits.is_some()), || {
+        "is given together with spec.splits: keep one of them".into()
+    });
+    c.check("spec.blockSize", spec.block_size.is_none_or(|b| b.bytes() > 0), || {
+        "is 0: give a size such as 64Mi".into()
+    });
+    c.range("spec.splits", spec.splits.map(|n| n as f64), 1.0, 1e6);
+    c.range("spec.overlapThreshold", spec.overlap_threshold, 0.0, 1.0);
+    check_workers(&mut c, job);
+    c.range("spec.taskSeconds", spec.task_seconds, 0.01, 3600.0);
+    c.0
+}
+
+fn check_image(c: &mut Checks, job: &RenderJob) {
+    let image = &job.spec.image;
+    for (i, camera) in image.cameras.iter().enumerate() {
+        let field = |name: &str| format!("spec.image.cameras[{i}].{name}");
+        if let Some(name) = &camera.name {
+            let allowed = |b: u8| b.is_ascii_alphanumeric() || b"._-".contains(&b);
+            c.check(&field("name"), !name.is_empty() && name.bytes().all(allowed), || {
+                format!("is {name:?}: use letters, digits, '.', '_' and '-'")
+            });
+            let first = image.cameras[..i].iter().position(|other| other.name.as_ref() == Some(name));
+            c.check(&field("name"), first.is_none(), || {
+                format!("is {name:?} like that of cameras[{}]: give each its own", first.unwrap_or(0))
+            });
+        }
+        let vectors = [("origin", camera.origin), ("target", camera.target), ("up", camera.up)];
+        for (name, v) in vectors {
+            c.check(&field(name), v.iter().all(|x| x.is_finite()), || format!("is {v:?}: give finite numbers"));
+        }
+        let view: [f64; 3] = std::array::from_fn(|k| camera.target[k] - camera.origin[k]);
+        c.check(&field("target"), view.iter().any(|&x| x != 0.0), || {
+            "is the camera's origin: choose a point that it looks at".into()
+        });
+        let cross: [f64; 3] = std::array::from_fn(|k| {
+            let (a, b) = ((k + 1) % 3, (k + 2) % 3);
+            view[a] * camera.up[b] - view[b] * camera.up[a]
+        });
+        c.check(&field("up"), cross.iter().any(|&x| x != 0.0), || {
+            "is zero or along the view: choose another direction".into()
+        });
+        c.range(&field("fov"), Some(camera.fov), 0.001, 179.0);
+    }
+    if let Some(output) = &image.output {
+        c.check("spec.image.output", output.ends_with(".exr") && output.len() > 4, || {
+            format!("is {output:?}: name a file that ends in .exr (the PNG is written beside it)")
+        });
+    }
+    c.range("spec.image.exposure", image.exposure, -32.0, 32.0);
+}
+
+fn check_workers(c: &mut Checks, job: &RenderJob) {
+    let workers = &job.spec.workers;
+    c.range("spec.workers.nodes", workers.nodes.map(f64::from), 1.0, 4096.0);
+    for (i, &slots) in workers.slots.iter().enumerate() {
+        c.range(&format!("spec.workers.slots[{i}]"), Some(f64::from(slots)), 1.0, 1024.0);
+    }
+    let nodes = workers.nodes.unwrap_or(1).max(1);
+    let fits = workers.slots.len() < 2 || workers.nodes.is_none_or(|n| n as usize == workers.slots.len());
+    c.check("spec.workers.slots", fits, || {
+        format!("has {} numbers for {nodes} nodes: give one for all, or one for each", workers.slots.len())
+    });
+    c.check("spec.workers.memory", workers.memory.is_none_or(|m| m.bytes() > 0), || {
+        "is 0: give the memory of one node, such as 4Gi".into()
+    });
+    c.range("spec.replicas", job.spec.replicas.map(f64::from), 1.0, 16.0);
+    let known_nodes = workers.nodes.map_or(workers.slots.len().max(1), |n| n.max(1) as usize);
+    if let Some(replicas) = job.spec.replicas {
+        c.check("spec.replicas", replicas < 1 || replicas as usize <= known_nodes, || {
+            format!("is {replicas}, but there are {known_nodes} nodes: ask for at most one copy per node")
+        });
+    }
+}
+
+struct Checks(Vec<Problem>);
+
+impl Checks {
+    fn check(&mut self, field: &str, ok: bool, message: impl FnOnce() -> String) {
+        if !ok {
+            self.0.push(Problem { field: field.to_owned(), message: message() });
+        }
+    }
+    fn range(&mut self, field: &str, value: Option<f64>, lo: f64, hi: f64) {
+        if let Some(value) = value {
+            self.check(field, (lo..=hi).contains(&value), || format!("is {value}: give {lo} to {hi}"));
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::{ByteSize, Strategy};
+
+    const FULL: &str = "
+apiVersion: rayherd.io/v1alpha1
+kind: RenderJob
+metadata:
+  name: chest
+  labels: {team: herd}
+  uid: left-alone
+spec:
+  scene: {source: chest, iso: -789.5, albedo: [0.7], sky: [0.1, 0.2, 0.3], parameters: {spp: '4'}}
+  image:
+    size: 256x256
+    cameras:
+    - {name: front, origin: [0, 0, 5], target: [0, 0, 0], fov: 40}
+    - {origin: [0, 0, -5], target: [0, 0, 0], up: [1, 0, 0], fov: 40}
+    output: chest.exr
+    exposure: -1.5
+  sampling: {spp: 64, targetError: 0.01, maxDepth: 8, rrDepth: 5, split: 4, seed: 7}
+  strategy: SchedulingGridOverlapReduced
+  splits: 32
+  overlapThreshold: 0.2
+  workers: {nodes: 4, slots: [2, 2, 4, 4], memory: 512Mi}
+  replicas: 2
+  barrier: true
+  taskSeconds: 10
+";
+
+    fn parse(text: &str) -> Result<RenderJob, serde_yaml::Error> {
+        serde_yaml::from_str(text)
+    }
+
+    #[test]
+    fn a_full_job_is_valid_and_survives_a_round_trip() {
+        let job = parse(FULL).unwrap();
+        assert_eq!(validate(&job), []);
+        assert_eq!(job.spec.workers.slots_per_node(1), Some(vec![2, 2, 4, 4]));
+        assert_eq!(job.spec.workers.memory.unwrap().bytes(), 512 << 20);
+        assert_eq!(parse(&serde_yaml::to_string(&job).unwrap()).unwrap(), job);
+    }
+
+    #[test]
+    fn the_least_job_is_valid() {
+        let text = "{apiVersion: rayherd.io/v1alpha1, kind: RenderJob, spec: {scene: {source: a.ply}}}";
+        let job = parse(text).unwrap();
+        assert_eq!(validate(&job), []);
+        assert_eq!(job.spec.strategy, Strategy::Auto);
+        assert_eq!(job.spec.workers.slots_per_node(3), Some(vec![3]));
+    }
+
+    #[test]
+    fn unknown_and_missing_fields_are_named_with_their_place() {
+        for (from, to, parts) in [
+            ("    size:", "    sise:", ["unknown field `sise`", "`size`"]),
+            ("  replicas: 2", "  replica: 2", ["unknown field `replica`", "`replicas`"]),
+            ("source: chest, ", "", ["missing field `source`", "spec.scene"]),
+            ("size: 256x256", "size: 256", ["spec.image", "WIDTHxHEIGHT"]),
+            ("size: 256x256", "size: 0x256", ["spec.image", "line 11"]),
+            ("memory: 512Mi", "memory: 512K", ["spec.workers", "ambiguous"]),
+            ("fov: 40}", "}", ["missing field `fov`", "cameras[0]"]),
+            ("GridOverlapReduced", "Grid2", ["unknown variant `SchedulingGrid2`", "`DemandDriven`"]),
+        ] {
+            let error = parse(&FULL.replacen(from, to, 1)).unwrap_err().to_string();
+            assert!(parts.iter().all(|p| error.contains(p)), "{from} -> {to}: {error}");
+        }
+    }
+
+    #[test]
+    fn every_problem_is_listed_with_its_field() {
+        let mut job = parse(FULL).unwrap();
+        job.api_version = "v1".into();
+        job.kind = "Job".into();
+        let spec = &mut job.spec;
+        spec.scene.source = " ".into();
+        spec.scene.iso = Some(f64::NAN);
+        spec.scene.sky = Some(vec![1.0, 2.0]);
+        spec.scene.albedo = Some(vec![1.5]);
+        spec.image.cameras[0].target = spec.image.cameras[0].origin;
+        spec.image.cameras[1].up = [0.0, 0.0, 1.0];
+        spec.image.cameras[1].fov = 180.0;
+        spec.image.cameras[1].name = Some("front".into());
+        spec.image.output = Some("a.png".into());
+        spec.image.exposure = Some(f64::INFINITY);
+        spec.sampling.spp = Some(1 << 25);
+        spec.sampling.target_error = Some(0.0);
+        spec.sampling.max_depth = Some(0);
+        spec.sampling.split = Some(-1);
+        spec.sampling.seed = Some(-7);
+        spec.block_size = Some(ByteSize::new(0));
+        spec.overlap_threshold = Some(1.1);
+        spec.workers.nodes = Some(3);
+        spec.workers.memory = Some(ByteSize::new(0));
+        spec.replicas = Some(4);
+        spec.task_seconds = Some(0.0);
+        let fields: Vec<String> = validate(&job).into_iter().map(|p| p.field).collect();
+        let want = [
+            "apiVersion",
+            "kind",
+            "spec.scene.source",
+            "spec.scene.iso",
+            "spec.scene.sky",
+            "spec.scene.albedo",
+            "spec.image.cameras[0].target",
+            "spec.image.cameras[0].up",
+            "spec.image.cameras[1].name",
+            "spec.image.cameras[1].up",
+            "spec.image.cameras[1].fov",
+            "spec.image.output",
+            "spec.image.exposure",
+            "spec.sampling.spp",
+            "spec.sampling.targetError",
+            "spec.sampling.maxDepth",
+            "spec.sampling.split",
+            "spec.sampling.seed",
+            "spec.blockSize",
+            "spec.blockSize",
+            "spec.overlapThreshold",
+            "spec.workers.slots",
+            "spec.workers.memory",
+            "spec.replicas",
+            "spec.taskSeconds",
+        ];
+        assert_eq!(fields, want);
+    }
+
+    /// Kubernetes' structural schemas have int32, int64 and no unsigned formats.
+    #[test]
+    fn the_schema_has_no_unsigned_formats() {
+        let schema = serde_json::to_string(&schemars::schema_for!(RenderJob)).unwrap();
+        assert!(schema.contains("\"int32\"") && schema.contains("overlapThreshold"), "{schema}");
+        assert!(!schema.contains("uint"), "{schema}");
+    }
+}
