@@ -1,12 +1,25 @@
 //! Where blocks, ray groups and film parts live: one trait, several backends, layers around them.
 
+#[cfg(any(test, feature = "testing"))]
+pub mod conformance;
+mod directory;
+mod key;
+mod memory;
+
 use async_trait::async_trait;
 use bytes::Bytes;
 
+pub use directory::DirectoryStore;
+pub use key::{check_key, check_prefix};
+pub use memory::MemoryStore;
+
 /// A flat space of named, immutable objects.
 ///
-/// A `put` is atomic: readers see the whole object or none. Keys are `/`-separated, of `[A-Za-z0-9._-]`, never empty,
-/// never with `..`. Putting a key again replaces it (content-addressed keys make that harmless).
+/// A `put` is atomic: readers see the whole object or none. Keys are `/`-separated segments of `[A-Za-z0-9._-]`, none
+/// empty, none beginning with a dot ([`check_key`]). Putting a key again replaces it (content-addressed keys make that
+/// harmless). A key must not be a folder of another (`a` beside `a/b`): some backends cannot hold both.
+///
+/// A `put` that fails with [`StoreError::Unavailable`] may have happened all the same; putting again is safe.
 #[async_trait]
 pub trait BlockStore: Send + Sync {
     /// Stores an object.
@@ -15,7 +28,7 @@ pub trait BlockStore: Send + Sync {
     async fn get(&self, key: &str) -> Result<Bytes, StoreError>;
     /// Size of an object in bytes, `None` when there is none.
     async fn size(&self, key: &str) -> Result<Option<u64>, StoreError>;
-    /// Keys with the prefix, ascending, with sizes.
+    /// Keys that begin with the prefix (any string prefix, not only whole segments), ascending by bytes, with sizes.
     async fn list(&self, prefix: &str) -> Result<Vec<(String, u64)>, StoreError>;
     /// Deletes objects; those that are not there are no error.
     async fn delete(&self, keys: &[String]) -> Result<(), StoreError>;

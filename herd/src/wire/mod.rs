@@ -1,0 +1,5 @@
+//! What travels and what is kept: byte formats with version, checksum and bounded lengths.
+
+pub mod envelope;
+
+pub use envelope::{Compress, Kind, WireError, open, seal};
