@@ -15,6 +15,15 @@ pub struct Place {
     pub line: u32,
 }
 
+impl std::fmt::Display for Place {
+    fn fmt(&self, f: &mut std::fmt::Formatter) -> std::fmt::Result {
+        match self.line {
+            0 => write!(f, "{}", self.file.display()),
+            line => write!(f, "{}:{line}", self.file.display()),
+        }
+    }
+}
+
 /// An affine map, rows of a 3 x 4 matrix: `p' = m[..][0..3] p + m[..][3]`.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Affine(pub [[f64; 4]; 3]);
@@ -57,11 +66,17 @@ pub enum Geometry {
         path: PathBuf,
         /// Its format.
         format: MeshFormat,
+        /// Texture coordinate v becomes 1 - v.
+        flip_v: bool,
+        /// Where the file has no normals, smooth ones are computed (unless [`Shape::face_normals`]).
+        smooth: bool,
     },
     /// Triangles given in the description itself (rectangle, cube). Positions in object space.
     Inline {
         /// Vertices.
         positions: Vec<[f64; 3]>,
+        /// Texture coordinates by vertex; empty if there are none.
+        uv: Vec<[f32; 2]>,
         /// Triangles, counter-clockwise from the front.
         triangles: Vec<[u32; 3]>,
     },
@@ -123,7 +138,7 @@ pub struct Camera {
 }
 
 /// Everything that a source says.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Description {
     /// In source order: the order of records.
     pub shapes: Vec<Shape>,
@@ -145,6 +160,10 @@ pub struct Description {
     pub rr_depth: Option<u32>,
     /// What was replaced by a stand-in on request, for log and report.
     pub substitutions: Vec<Substitution>,
+    /// World-space bounds of all primitives, if importing had to find them (to frame a scene without a camera).
+    pub bounds: Option<[[f64; 3]; 2]>,
+    /// Bytes of the source that importing itself read.
+    pub bytes_read: u64,
 }
 
 /// Something unsupported that was replaced on request (`--substitute`).

@@ -1,6 +1,7 @@
 //! From files to a prepared scene: importing, cutting into splits, the scheduling grid, overlap reduction, manifest.
 
 pub mod description;
+pub mod import;
 pub mod record;
 
 use std::path::PathBuf;
@@ -19,7 +20,7 @@ pub enum ImportError {
         source: std::io::Error,
     },
     /// The content is not what the format says.
-    #[error("{file}:{line}: {message}", file = place.file.display(), line = place.line)]
+    #[error("{place}: {message}")]
     Malformed {
         /// Where.
         place: Place,
@@ -40,7 +41,6 @@ pub enum ImportError {
 }
 
 fn list(elements: &[(Place, String)]) -> String {
-    let rows: Vec<String> =
-        elements.iter().map(|(p, what)| format!("  {}:{}: {what}", p.file.display(), p.line)).collect();
+    let rows: Vec<String> = elements.iter().map(|(place, what)| format!("  {place}: {what}")).collect();
     rows.join("\n")
 }

@@ -1,0 +1,228 @@
+//! Mitsuba scene files (0.5, 0.6, 2 and 3) to a [`Description`].
+//!
+//! Parsing ([`xml`]) knows nothing of rendering: it yields objects with typed properties. Converting asks each object for the
+//! properties it understands; whatever nobody asked for is unsupported, and all such elements are reported together.
+//!
+//! Rules where Rayherd reads a file differently from Mitsuba:
+//! - An integrator says how an image is computed, not what is in it: every integrator that estimates the full light transport
+//!   (`path`, `volpath`, `bdpt`, `path_guiding_integrator`, ...) stands for our path tracer with its `max_depth` and
+//!   `rr_depth`; `direct` is a path of depth 2. Others (`ao`, `depth`, `aov`, ...) are unsupported.
+//! - The sampler's kind is ignored, its `sample_count` is used.
+//! - Clip planes and focus distance of a perspective sensor are ignored: nothing is clipped.
+//! - A scene without a sensor is framed by the rule for bare meshes ([`super::framing`]).
+
+mod bsdf;
+mod emitter;
+mod scene;
+mod sensor;
+mod shape;
+mod transform;
+mod value;
+mod xml;
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::Path;
+
+use self::xml::{Document, ObjectId, Property, Value, malformed};
+use super::ImportOptions;
+use crate::ImportError;
+use crate::description::{Affine, Description, Place, Substitution};
+
+/// Reads a scene file.
+pub(super) fn import(path: &Path, options: &ImportOptions) -> Result<Description, ImportError> {
+    let document = Document::read(path, &options.defines)?;
+    let mut converter = Converter {
+        document: &document,
+        options,
+        out: Description::default(),
+        unsupported: vec![],
+        materials: BTreeMap::new(),
+        open: BTreeSet::new(),
+    };
+    for (place, what) in &document.unknown {
+        converter.unsupported(place, what, "nothing");
+    }
+    converter.scene()?;
+    if !converter.unsupported.is_empty() {
+        converter.unsupported.sort_by(|a, b| (&a.0.file, a.0.line).cmp(&(&b.0.file, b.0.line)));
+        return Err(ImportError::Unsupported(converter.unsupported));
+    }
+    let mut out = converter.out;
+    out.bytes_read = document.bytes_read;
+    Ok(out)
+}
+
+/// State of a conversion.
+struct Converter<'a> {
+    document: &'a Document,
+    options: &'a ImportOptions,
+    out: Description,
+    unsupported: Vec<(Place, String)>,
+    /// Materials made so far, by object.
+    materials: BTreeMap<ObjectId, u32>,
+    /// Objects being converted, to find cycles of references.
+    open: BTreeSet<ObjectId>,
+}
+
+impl<'a> Converter<'a> {
+    /// Notes something unsupported, or its stand-in when stand-ins are allowed.
+    fn unsupported(&mut self, place: &Place, what: impl Into<String>, stand_in: &str) {
+        let (place, what) = (place.clone(), what.into());
+        if self.options.substitute {
+            self.out.substitutions.push(Substitution { place, what, stand_in: stand_in.into() });
+        } else {
+            self.unsupported.push((place, what));
+        }
+    }
+
+    /// The property of a name, marked as used.
+    fn property(&self, object: ObjectId, name: &str) -> Option<&'a Property> {
+        let found = self.document.objects[object].properties.iter().rev().find(|p| p.name == name)?;
+        found.used.set(true);
+        Some(found)
+    }
+
+    /// Marks properties that do not change what we compute.
+    fn ignore(&self, object: ObjectId, names: &[&str]) {
+        for property in &self.document.objects[object].properties {
+            if names.contains(&property.name.as_str()) {
+                property.used.set(true);
+            }
+        }
+    }
+
+    fn float(&self, object: ObjectId, name: &str) -> Result<Option<f64>, ImportError> {
+        match self.property(object, name) {
+            None => Ok(None),
+            Some(p) => match p.value {
+                Value::Float(v) => Ok(Some(v)),
+                Value::Integer(v) => Ok(Some(v as f64)),
+                _ => malformed(&p.place, format!("\"{name}\" should be a <float>")),
+            },
+        }
+    }
+
+    fn integer(&self, object: ObjectId, name: &str) -> Result<Option<i64>, ImportError> {
+        match self.property(object, name) {
+            None => Ok(None),
+            Some(p) => match p.value {
+                Value::Integer(v) => Ok(Some(v)),
+                _ => malformed(&p.place, format!("\"{name}\" should be an <integer>")),
+            },
+        }
+    }
+
+    fn boolean(&self, object: ObjectId, name: &str) -> Result<Option<bool>, ImportError> {
+        match self.property(object, name) {
+            None => Ok(None),
+            Some(p) => match p.value {
+                Value::Boolean(v) => Ok(Some(v)),
+                _ => malformed(&p.place, format!("\"{name}\" should be a <boolean>")),
+            },
+        }
+    }
+
+    fn string(&self, object: ObjectId, name: &str) -> Result<Option<(&'a str, &'a Place)>, ImportError> {
+        match self.property(object, name) {
+            None => Ok(None),
+            Some(p) => match &p.value {
+                Value::String(v) => Ok(Some((v, &p.place))),
+                _ => malformed(&p.place, format!("\"{name}\" should be a <string>")),
+            },
+        }
+    }
+
+    fn point(&self, object: ObjectId, name: &str) -> Result<Option<[f64; 3]>, ImportError> {
+        match self.property(object, name) {
+            None => Ok(None),
+            Some(p) => match p.value {
+                Value::Vector(v) => Ok(Some(v)),
+                _ => malformed(&p.place, format!("\"{name}\" should be a <point>")),
+            },
+        }
+    }
+
+    fn transform(&self, object: ObjectId, name: &str) -> Result<Affine, ImportError> {
+        match self.property(object, name) {
+            None => Ok(Affine::IDENTITY),
+            Some(p) => match p.value {
+                Value::Transform(map) => Ok(map),
+                _ => malformed(&p.place, format!("\"{name}\" should be a <transform>")),
+            },
+        }
+    }
+
+    /// A constant colour; a texture or a measured spectrum is unsupported and `stand_in` (a grey) stands for it.
+    fn color(&mut self, object: ObjectId, name: &str, stand_in: f64) -> Result<Option<[f64; 3]>, ImportError> {
+        let Some(p) = self.property(object, name) else { return Ok(None) };
+        let what = match &p.value {
+            Value::Color(rgb) => return Ok(Some(*rgb)),
+            Value::Float(v) => return Ok(Some([*v; 3])),
+            Value::Integer(v) => return Ok(Some([*v as f64; 3])),
+            Value::Spectrum(text) => format!("spectrum \"{}\" for \"{name}\"", shorten(text)),
+            Value::Object(_) | Value::Reference(_) => {
+                let Some(id) = self.document.object(p)? else { return Ok(None) };
+                let texture = &self.document.objects[id];
+                match (texture.class.as_str(), texture.plugin.as_str()) {
+                    ("spectrum" | "texture", "uniform") => {
+                        return Ok(self.float(id, "value")?.map(|v| [v; 3]));
+                    }
+                    (class, plugin) => format!("{class} \"{plugin}\" for \"{name}\""),
+                }
+            }
+            _ => return malformed(&p.place, format!("\"{name}\" should be a colour")),
+        };
+        self.unsupported(&p.place, what, &format!("the grey {stand_in}"));
+        Ok(Some([stand_in; 3]))
+    }
+
+    /// Nested objects and references of a class, in source order, marked as used.
+    fn nested(&self, object: ObjectId, class: &str) -> Result<Vec<(&'a Property, ObjectId)>, ImportError> {
+        let mut found = vec![];
+        for property in &self.document.objects[object].properties {
+            if let Some(id) = self.document.object(property)?
+                && self.document.objects[id].class == class
+            {
+                property.used.set(true);
+                found.push((property, id));
+            }
+        }
+        Ok(found)
+    }
+
+    /// Begins an object; refuses one that contains itself by references.
+    fn enter(&mut self, object: ObjectId, from: &Place) -> Result<(), ImportError> {
+        if self.open.insert(object) {
+            return Ok(());
+        }
+        let o = &self.document.objects[object];
+        let name = o.id.clone().unwrap_or_else(|| o.plugin.clone());
+        malformed(from, format!("references form a cycle through \"{name}\""))
+    }
+
+    /// Ends an object: what nobody asked for is unsupported.
+    fn leave(&mut self, object: ObjectId) {
+        self.open.remove(&object);
+        let o = &self.document.objects[object];
+        for p in o.properties.iter().filter(|p| !p.used.get()) {
+            p.used.set(true);
+            let what = match &p.value {
+                Value::Object(id) => {
+                    let inner = &self.document.objects[*id];
+                    format!("{} \"{}\" in {} \"{}\"", inner.class, inner.plugin, o.class, o.plugin)
+                }
+                Value::Reference(id) => format!("ref to \"{id}\" in {} \"{}\"", o.class, o.plugin),
+                _ => format!("property \"{}\" of {} \"{}\"", p.name, o.class, o.plugin),
+            };
+            self.unsupported(&p.place, what, "nothing");
+        }
+    }
+}
+
+/// The first characters of a long text.
+fn shorten(text: &str) -> String {
+    if text.chars().count() <= 40 { text.into() } else { text.chars().take(40).chain("...".chars()).collect() }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,123 @@
+//! Shapes: mesh files, rectangle, cube, sphere.
+
+use super::Converter;
+use super::xml::{ObjectId, malformed};
+use crate::ImportError;
+use crate::description::{Affine, Geometry, MeshFormat, Place, Shape};
+use crate::import::shapes;
+use crate::import::vector::dot;
+
+impl Converter<'_> {
+    pub(super) fn shape(&mut self, id: ObjectId, from: &Place) -> Result<(), ImportError> {
+        self.enter(id, from)?;
+        let object = &self.document.objects[id];
+        let place = &object.place;
+        let mut to_world = self.transform(id, "to_world")?;
+        if !to_world.determinant().is_finite() {
+            return malformed(place, "to_world is too large for floating point");
+        }
+        let mut flip = self.boolean(id, "flip_normals")?.unwrap_or(false);
+        let mut face_normals = self.boolean(id, "face_normals")?.unwrap_or(false);
+        let geometry = match object.plugin.as_str() {
+            "rectangle" => Some(shapes::rectangle()),
+            "cube" => Some(shapes::cube()),
+            "sphere" => Some(self.sphere(id, &mut to_world, &mut flip)?),
+            "ply" => self.mesh(id, MeshFormat::Ply, false)?,
+            "obj" => self.mesh(id, MeshFormat::Obj, true)?,
+            "stl" => {
+                face_normals = true;
+                self.mesh(id, MeshFormat::Stl, false)?
+            }
+            plugin => {
+                self.unsupported(place, format!("shape \"{plugin}\""), "nothing");
+                object.properties.iter().for_each(|p| p.used.set(true));
+                None
+            }
+        };
+        let emitters = self.nested(id, "emitter")?;
+        if emitters.len() > 1 {
+            return malformed(&emitters[1].0.place, "a second emitter in one shape");
+        }
+        let mut emission = None;
+        for (_, emitter) in emitters {
+            emission = Some(self.area_emitter(emitter)?).filter(|rgb| rgb.iter().any(|v| *v > 0.0));
+        }
+        let bsdfs = self.nested(id, "bsdf")?;
+        if bsdfs.len() > 1 {
+            return malformed(&bsdfs[1].0.place, "a second bsdf in one shape");
+        }
+        let material = match bsdfs.first() {
+            Some((p, bsdf)) => self.material(*bsdf, &p.place)?,
+            None => self.default_material(emission.is_some()),
+        };
+        self.ignore(id, &["silhouette_sampling_weight"]);
+        self.leave(id);
+        let Some(geometry) = geometry else { return Ok(()) };
+        let name = match (&object.id, &geometry) {
+            (Some(id), _) => id.clone(),
+            (None, Geometry::MeshFile { path, .. }) => {
+                path.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default()
+            }
+            (None, _) => object.plugin.clone(),
+        };
+        self.out.shapes.push(Shape {
+            name,
+            place: place.clone(),
+            geometry,
+            to_world,
+            material,
+            emission,
+            flip_normals: flip,
+            face_normals,
+        });
+        Ok(())
+    }
+
+    fn mesh(&mut self, id: ObjectId, format: MeshFormat, flip_v: bool) -> Result<Option<Geometry>, ImportError> {
+        let object = &self.document.objects[id];
+        let Some((name, place)) = self.string(id, "filename")? else {
+            return malformed(&object.place, format!("shape \"{}\" lacks its filename", object.plugin));
+        };
+        let path = self.document.resolve(name, place)?;
+        let flip_v = self.boolean(id, "flip_tex_coords")?.unwrap_or(flip_v);
+        // 0.6: normals above this crease angle are split; without it its default is to use what the file has
+        for name in ["max_smooth_angle", "shape_index"] {
+            if let Some(p) = self.property(id, name) {
+                self.unsupported(&p.place, format!("property \"{name}\" of shape \"{}\"", object.plugin), "nothing");
+            }
+        }
+        Ok(Some(Geometry::MeshFile { path, format, flip_v, smooth: true }))
+    }
+
+    /// Mitsuba's sphere: `to_world * translate(center) * scale(radius)`; a mirroring map turns it inside out.
+    fn sphere(&mut self, id: ObjectId, to_world: &mut Affine, flip: &mut bool) -> Result<Geometry, ImportError> {
+        let place = &self.document.objects[id].place;
+        let center = self.point(id, "center")?.unwrap_or([0.0; 3]);
+        let radius = self.float(id, "radius")?.unwrap_or(1.0);
+        let columns = [0, 1, 2].map(|c| [0, 1, 2].map(|r| to_world.0[r][c]));
+        let lengths = columns.map(|c| dot(c, c).sqrt());
+        if radius == 0.0 || lengths.contains(&0.0) {
+            return malformed(place, "a sphere of radius 0");
+        }
+        if !is_similarity(columns, lengths[0]) {
+            let stand_in = "the sphere whose radius is that along x";
+            self.unsupported(place, "sphere under a map that is no similarity (an ellipsoid)", stand_in);
+        }
+        if (to_world.determinant() < 0.0) != (radius < 0.0) {
+            *flip = !*flip;
+        }
+        let center = to_world.point(center);
+        let radius = radius.abs() * lengths[0];
+        *to_world = Affine::IDENTITY;
+        Ok(Geometry::Sphere { center, radius })
+    }
+}
+
+/// Whether three columns are at right angles and equally long, to the precision that files write (1e-4 relative).
+fn is_similarity(columns: [[f64; 3]; 3], length: f64) -> bool {
+    let within = 1e-4 * length * length;
+    (0..3).all(|i| {
+        let j = (i + 1) % 3;
+        dot(columns[i], columns[j]).abs() <= within && (dot(columns[i], columns[i]) - length * length).abs() <= within
+    })
+}
