@@ -1,7 +1,11 @@
 //! From files to a prepared scene: importing, cutting into splits, the scheduling grid, overlap reduction, manifest.
 
 pub mod description;
+pub mod grid;
 pub mod import;
+pub mod manifest;
+pub mod objects;
+pub mod prepare;
 pub mod record;
 
 use std::path::PathBuf;

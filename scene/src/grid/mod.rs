@@ -1,0 +1,174 @@
+//! The scheduling grid: which split owns which part of space.
+//!
+//! `subdiv`^3 cells over the scene's box. A primitive belongs to every cell that it overlaps; an occupied cell knows
+//! the splits that hold its primitives (its *owners*) and the tight box of what is inside it. A ray that may still
+//! hit something outside the resident splits finds out here where to go ([`Grid::next_foreign`]).
+
+pub mod lattice;
+mod splitset;
+#[cfg(test)]
+mod tests;
+pub mod walk;
+
+use serde::{Deserialize, Serialize};
+
+pub use lattice::{Lattice, MAX_SUBDIV};
+pub use splitset::SplitSet;
+pub use walk::{Foreign, Progress};
+
+/// A grid as the manifest holds it.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct GridData {
+    /// Cells along each axis, 1 to [`MAX_SUBDIV`].
+    pub subdiv: u32,
+    /// Lower corner of the scene's box, recentred.
+    pub lo: [f32; 3],
+    /// Upper corner of the scene's box, recentred.
+    pub hi: [f32; 3],
+    /// Occupied cells by ascending index.
+    pub cells: Vec<CellData>,
+}
+
+/// One occupied cell.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct CellData {
+    /// `x + subdiv * (y + subdiv * z)`.
+    pub index: u32,
+    /// Lower corner of the box that holds every point of its primitives in the cell.
+    pub lo: [f32; 3],
+    /// Upper corner of that box.
+    pub hi: [f32; 3],
+    /// Primitives that overlap it.
+    pub primitives: u64,
+    /// Splits that hold them, ascending; one after overlap reduction.
+    pub owners: Vec<u32>,
+}
+
+/// Why a grid is refused.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[error("scheduling grid: {0}")]
+pub struct GridError(pub String);
+
+/// A checked grid, ready to be walked.
+#[derive(Clone, Debug)]
+pub struct Grid {
+    lattice: Lattice,
+    cells: Vec<Cell>,
+    owners: Vec<u32>,
+    /// Cell number by lattice index, [`EMPTY`] where there is none.
+    dense: Vec<u32>,
+    owning: SplitSet,
+}
+
+/// What the walk needs of a cell.
+#[derive(Clone, Copy, Debug)]
+struct Cell {
+    lo: [f32; 3],
+    hi: [f32; 3],
+    first_owner: u32,
+    owner_count: u32,
+}
+
+/// Marks an empty cell.
+const EMPTY: u32 = u32::MAX;
+
+impl Grid {
+    /// Checks a grid over `splits` splits and makes it ready. Never panics, whatever the data.
+    pub fn new(data: &GridData, splits: u32) -> Result<Grid, GridError> {
+        let refuse = |message: String| Err(GridError(message));
+        let lattice = Lattice::new(data.subdiv, data.lo, data.hi).map_err(GridError)?;
+        if data.cells.is_empty() {
+            return refuse("no cell is occupied".to_owned());
+        }
+        let mut cells = Vec::with_capacity(data.cells.len());
+        let mut owners = Vec::new();
+        let mut dense = vec![EMPTY; lattice.len()];
+        let mut owning = SplitSet::with_capacity(splits);
+        let mut last = None;
+        for cell in &data.cells {
+            if last.is_some_and(|l| cell.index <= l) {
+                return refuse(format!("cell {} is out of order", cell.index));
+            }
+            last = Some(cell.index);
+            let Some(at) = lattice.coordinates(cell.index) else {
+                return refuse(format!("cell {} lies outside the grid", cell.index));
+            };
+            let (lo, hi) = lattice.cell_box_f32(at);
+            for a in 0..3 {
+                // NaN fails too
+                if !(lo[a] <= cell.lo[a] && cell.lo[a] <= cell.hi[a] && cell.hi[a] <= hi[a]) {
+                    return refuse(format!("the box of cell {} is not inside the cell", cell.index));
+                }
+            }
+            let ascending = cell.owners.windows(2).all(|w| w[0] < w[1]);
+            if cell.owners.is_empty() || !ascending || cell.owners.iter().any(|&s| s >= splits) {
+                return refuse(format!("the owners of cell {} are no ascending splits", cell.index));
+            }
+            dense[cell.index as usize] = cells.len() as u32;
+            cells.push(Cell {
+                lo: cell.lo,
+                hi: cell.hi,
+                first_owner: owners.len() as u32,
+                owner_count: cell.owners.len() as u32,
+            });
+            owners.extend_from_slice(&cell.owners);
+            cell.owners.iter().for_each(|&s| owning.insert(s));
+        }
+        if owners.len() > u32::MAX as usize {
+            return refuse("too many owners".to_owned());
+        }
+        Ok(Grid { lattice, cells, owners, dense, owning })
+    }
+
+    /// Its geometry.
+    pub fn lattice(&self) -> &Lattice {
+        &self.lattice
+    }
+
+    /// Number of occupied cells; a cell's number is its place among them by ascending index.
+    pub fn occupied(&self) -> u32 {
+        self.cells.len() as u32
+    }
+
+    /// Owners of an occupied cell by its number, ascending; none for a number that does not exist.
+    pub fn owners(&self, cell: u32) -> &[u32] {
+        self.cells.get(cell as usize).map_or(&[], |c| self.owners_of(c))
+    }
+
+    /// Tight box of an occupied cell by its number.
+    pub fn bounds(&self, cell: u32) -> Option<([f32; 3], [f32; 3])> {
+        self.cells.get(cell as usize).map(|c| (c.lo, c.hi))
+    }
+
+    /// The splits that own a cell: after overlap reduction some source splits own none.
+    pub fn owning(&self) -> &SplitSet {
+        &self.owning
+    }
+
+    /// Whether no ray can ever need another split: every owner is resident. Ask once per resident set, and skip the
+    /// walk when it is so.
+    pub fn covered_by(&self, resident: &SplitSet) -> bool {
+        self.owning.is_subset(resident)
+    }
+
+    /// The splits that share a cell with `split`, itself included, ascending: what the paper's system without overlap
+    /// reduction loads together.
+    pub fn sharing(&self, split: u32) -> Vec<u32> {
+        let mut set = SplitSet::default();
+        set.insert(split);
+        for cell in &self.cells {
+            let owners = self.owners_of(cell);
+            if owners.binary_search(&split).is_ok() {
+                owners.iter().for_each(|&s| set.insert(s));
+            }
+        }
+        set.iter().collect()
+    }
+
+    fn owners_of(&self, cell: &Cell) -> &[u32] {
+        let first = cell.first_owner as usize;
+        &self.owners[first..first + cell.owner_count as usize]
+    }
+}

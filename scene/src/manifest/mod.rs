@@ -1,0 +1,301 @@
+//! What a prepared scene is: every object by hash, the grid, and what was counted.
+
+mod check;
+#[cfg(test)]
+mod tests;
+
+use rayherd_render::filter::Filter;
+use rayherd_render::ray::PrimId;
+use serde::{Deserialize, Serialize};
+
+use crate::description::{Camera, Description, Substitution};
+use crate::grid::{Grid, GridData};
+use crate::objects::{ObjectError, ObjectHash, ObjectKind, ObjectRef, ObjectStore};
+use crate::prepare::PrepareSettings;
+
+/// Version of the manifest and of everything it names. A change of any layout, of recentring, of the order of records
+/// or of the grid's rules changes it; scenes of other versions are prepared again.
+pub const FORMAT: u32 = 1;
+
+/// A prepared scene. Its bytes are canonical ([`Manifest::encode`]); its name is their hash.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Manifest {
+    /// [`FORMAT`].
+    pub format: u32,
+    /// How it was made.
+    pub settings: PrepareSettings,
+    /// Fingerprint of the source: see [`crate::prepare::fingerprint`].
+    pub source: ObjectHash,
+    /// Hash of every usable record (id, recentred f32 geometry, attributes) in source order and of the world: what
+    /// defines the picture, the same however the scene was cut and wherever its files lie.
+    pub content: ObjectHash,
+    /// Centre of the source's bounds, source coordinates: `recentred = source - offset`.
+    pub offset: [f64; 3],
+    /// Lower corner of the scene's box, recentred.
+    pub lo: [f32; 3],
+    /// Upper corner of the scene's box, recentred.
+    pub hi: [f32; 3],
+    /// The world object: [`rayherd_render::world::World`] as JSON, put as [`ObjectKind::Manifest`].
+    pub world: ObjectRef,
+    /// Splits by number: those cut from the source, in its order, then the copied ones.
+    pub splits: Vec<SplitEntry>,
+    /// The scheduling grid.
+    pub grid: GridData,
+    /// How the grid was chosen.
+    pub choice: GridChoice,
+    /// What the source says about camera, film and paths.
+    pub defaults: Defaults,
+    /// What was counted.
+    pub counts: Counts,
+}
+
+/// One split.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct SplitEntry {
+    /// Block with tree, triangles, spheres and ids.
+    pub geometry: ObjectRef,
+    /// Shape numbers, normals, texture coordinates.
+    pub attributes: ObjectRef,
+    /// Triangles in it.
+    pub triangles: u64,
+    /// Spheres in it.
+    pub spheres: u64,
+    /// Lower corner of its primitives' box.
+    pub lo: [f32; 3],
+    /// Upper corner of its primitives' box.
+    pub hi: [f32; 3],
+    /// Least global id in it.
+    pub first_id: PrimId,
+    /// Largest global id in it.
+    pub last_id: PrimId,
+    /// Made by overlap reduction: every primitive in it is in another split as well.
+    pub copied: bool,
+}
+
+/// What stopped the search for a subdivision.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum StoppedBy {
+    /// Condition 2 is met: the share of primitives in contested cells is at or below the threshold.
+    Threshold,
+    /// Condition 3: occupied cells are several times the splits.
+    Several,
+    /// The largest subdivision allowed was reached.
+    Limit,
+}
+
+/// How the grid was chosen, and what overlap reduction did.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct GridChoice {
+    /// Subdivisions that were counted, ascending.
+    pub candidates: Vec<Candidate>,
+    /// Why the chosen one was taken.
+    pub stopped_by: StoppedBy,
+    /// Primitives that a split holds (condition 1).
+    pub capacity: u64,
+    /// Contested cells before overlap reduction.
+    pub contested_cells: u64,
+    /// Primitives in at least one contested cell, each counted once, before overlap reduction.
+    pub contested_primitives: u64,
+    /// Primitives in copied splits, each counted once per split.
+    pub copies: u64,
+    /// Geometry and attribute bytes of copied splits.
+    pub rewritten_bytes: u64,
+}
+
+/// What was counted for one subdivision.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Candidate {
+    /// Cells along an axis.
+    pub subdiv: u32,
+    /// Occupied cells.
+    pub occupied: u64,
+    /// Most primitives in a cell.
+    pub fullest: u64,
+    /// (primitive, cell) pairs.
+    pub pairs: u64,
+    /// Of those, in cells that several splits claim.
+    pub contested_pairs: u64,
+}
+
+impl Candidate {
+    /// Share of primitives in contested cells, a primitive counted in every cell that it overlaps.
+    pub fn contested_share(&self) -> f64 {
+        if self.pairs == 0 { 0.0 } else { self.contested_pairs as f64 / self.pairs as f64 }
+    }
+}
+
+/// What the source says about camera, film and paths. The camera is in source coordinates: subtract
+/// [`Manifest::offset`] from its position.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Defaults {
+    /// The camera, if the source has one.
+    pub camera: Option<Camera>,
+    /// Width and height in pixels.
+    pub size: Option<[u32; 2]>,
+    /// Pixel filter.
+    pub filter: Option<Filter>,
+    /// Samples per pixel.
+    pub spp: Option<u32>,
+    /// As in [`Description::max_depth`].
+    pub max_depth: Option<u32>,
+    /// As in [`Description::rr_depth`].
+    pub rr_depth: Option<u32>,
+    /// Stand-ins that were made on request.
+    pub substitutions: Vec<Substitution>,
+}
+
+impl Defaults {
+    /// What `description` says.
+    pub fn of(description: &Description) -> Self {
+        Defaults {
+            camera: description.camera.clone(),
+            size: description.size,
+            filter: description.filter,
+            spp: description.spp,
+            max_depth: description.max_depth,
+            rr_depth: description.rr_depth,
+            substitutions: description.substitutions.clone(),
+        }
+    }
+}
+
+/// What was counted while preparing.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Counts {
+    /// Records in the source, skipped ones too: global ids are below this.
+    pub records: u64,
+    /// Usable triangles.
+    pub triangles: u64,
+    /// Usable spheres.
+    pub spheres: u64,
+    /// Skipped: triangles of zero area, spheres of radius 0.
+    pub degenerate: u64,
+    /// Skipped: NaN or infinity in a coordinate.
+    pub non_finite: u64,
+    /// Skipped: a coordinate beyond what tracing can compute with.
+    pub out_of_range: u64,
+    /// Times that the source was read.
+    pub source_reads: u32,
+    /// Bytes of all these reads.
+    pub source_bytes: u64,
+}
+
+/// Why a manifest is refused.
+#[derive(Debug, thiserror::Error)]
+pub enum ManifestError {
+    /// The bytes are no manifest.
+    #[error("not a manifest: {0}; prepare the scene again")]
+    Malformed(String),
+    /// Made by another version.
+    #[error("the scene was prepared in format {found}, this program reads format {FORMAT}; prepare it again")]
+    Format {
+        /// Its format.
+        found: u64,
+    },
+    /// The store has a problem.
+    #[error(transparent)]
+    Store(#[from] ObjectError),
+}
+
+impl Manifest {
+    /// Its bytes: the same manifest has the same bytes.
+    pub fn encode(&self) -> Vec<u8> {
+        let mut bytes = serde_json::to_vec(self).unwrap_or_default();
+        bytes.push(b'\n');
+        bytes
+    }
+
+    /// Reads and checks a manifest: every index is in range, every number makes sense, and the bytes are canonical.
+    /// Never panics.
+    pub fn decode(bytes: &[u8]) -> Result<Manifest, ManifestError> {
+        #[derive(Deserialize)]
+        struct Head {
+            format: u64,
+        }
+        let malformed = |e: serde_json::Error| ManifestError::Malformed(e.to_string());
+        let head: Head = serde_json::from_slice(bytes).map_err(malformed)?;
+        if head.format != u64::from(FORMAT) {
+            return Err(ManifestError::Format { found: head.format });
+        }
+        let manifest: Manifest = serde_json::from_slice(bytes).map_err(malformed)?;
+        manifest.check().map_err(ManifestError::Malformed)?;
+        if manifest.encode() != bytes {
+            return Err(ManifestError::Malformed("its bytes are not canonical".to_owned()));
+        }
+        Ok(manifest)
+    }
+
+    /// Its name: reference to its bytes.
+    pub fn reference(&self) -> ObjectRef {
+        ObjectRef::of(&self.encode())
+    }
+
+    /// Stores it and lets [`Manifest::lookup_name`] point to it.
+    pub fn store(&self, store: &dyn ObjectStore) -> Result<ObjectRef, ObjectError> {
+        let object = store.put(ObjectKind::Manifest, &self.encode())?;
+        store.set_name(&Self::lookup_name(&self.source, &self.settings), &object)?;
+        Ok(object)
+    }
+
+    /// Reads the manifest that a reference names.
+    pub fn load(store: &dyn ObjectStore, object: &ObjectRef) -> Result<Manifest, ManifestError> {
+        Self::decode(&store.get(object)?)
+    }
+
+    /// The name under which a scene of this source and these settings is found.
+    pub fn lookup_name(source: &ObjectHash, settings: &PrepareSettings) -> String {
+        let settings = serde_json::to_vec(settings).unwrap_or_default();
+        let mut hasher = blake3::Hasher::new();
+        hasher.update(b"rayherd prepared scene\0").update(&FORMAT.to_le_bytes()).update(&source.0).update(&settings);
+        format!("scene-{}", hasher.finalize().to_hex())
+    }
+
+    /// Looks for a scene that was prepared from this source with these settings, and whose objects are all there.
+    pub fn find(
+        store: &dyn ObjectStore,
+        source: &ObjectHash,
+        settings: &PrepareSettings,
+    ) -> Result<Option<(ObjectRef, Manifest)>, ManifestError> {
+        let Some(object) = store.name(&Self::lookup_name(source, settings))? else { return Ok(None) };
+        let manifest = match Self::load(store, &object) {
+            Ok(manifest) => manifest,
+            // what is broken or old is prepared again
+            Err(ManifestError::Store(e @ (ObjectError::Failed { .. } | ObjectError::Name { .. }))) => {
+                return Err(e.into());
+            }
+            Err(reason) => {
+                tracing::warn!("the scene that was prepared before cannot be used: {reason}");
+                return Ok(None);
+            }
+        };
+        for needed in manifest.objects() {
+            if !store.has(needed)? {
+                tracing::warn!("object {} of the scene that was prepared before is missing", needed.hash);
+                return Ok(None);
+            }
+        }
+        Ok((manifest.source == *source && manifest.settings == *settings).then_some((object, manifest)))
+    }
+
+    /// Every object that it names, but itself.
+    pub fn objects(&self) -> impl Iterator<Item = &ObjectRef> {
+        std::iter::once(&self.world).chain(self.splits.iter().flat_map(|s| [&s.geometry, &s.attributes]))
+    }
+
+    /// Geometry and attribute bytes, copies left out: what a pass over the scene reads.
+    pub fn scene_bytes(&self) -> u64 {
+        self.splits.iter().filter(|s| !s.copied).map(|s| s.geometry.bytes + s.attributes.bytes).sum()
+    }
+
+    /// Its grid, ready to be walked.
+    pub fn grid(&self) -> Result<Grid, ManifestError> {
+        Grid::new(&self.grid, self.splits.len() as u32).map_err(|e| ManifestError::Malformed(e.to_string()))
+    }
+}
