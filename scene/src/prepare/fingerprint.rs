@@ -76,22 +76,19 @@ mod tests {
             shapes: vec![Shape {
                 name: "a".to_owned(),
                 place: Place::default(),
-                geometry: Geometry::MeshFile { path: path.clone(), format: MeshFormat::Ply },
+                geometry: Geometry::MeshFile {
+                    path: path.clone(),
+                    format: MeshFormat::Ply,
+                    flip_v: false,
+                    smooth: false,
+                },
                 to_world: Affine::IDENTITY,
                 material: 0,
                 emission: None,
                 flip_normals: false,
                 face_normals: false,
             }],
-            materials: vec![],
-            environment: None,
-            camera: None,
-            size: None,
-            filter: None,
-            spp: None,
-            max_depth: None,
-            rr_depth: None,
-            substitutions: vec![],
+            ..Default::default()
         };
         let first = fingerprint(&description).unwrap();
         assert_eq!(fingerprint(&description).unwrap(), first);
