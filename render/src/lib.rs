@@ -3,8 +3,19 @@
 //! This crate does no I/O, knows no clock, starts no thread and awaits nothing. What it computes is a function of
 //! its arguments, to the bit, on every machine.
 
+// `!(x > 0.0)` is true of NaN, which is what is meant
+#![allow(clippy::neg_cmp_op_on_partial_ord)]
+
+pub mod attributes;
 pub mod bvh;
+pub mod camera;
+pub mod film;
 pub mod filter;
+pub mod frame;
+pub mod light;
 pub mod material;
+pub mod math;
+pub mod path;
 pub mod ray;
+pub mod sampler;
 pub mod world;

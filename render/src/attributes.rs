@@ -1,0 +1,118 @@
+//! Shading attributes of a split's primitives, an object beside its geometry.
+//!
+//! Layout, little endian: `RHA1`, flags u32 (1: normals, 2: texture coordinates), number of primitives u32, number of runs u32, then the runs
+//! (length u32, shape u32; neighbours differ), then 9 f32 of normals per primitive, then 6 f32 of texture coordinates per
+//! primitive. A primitive without normals has nine zeros.
+
+const MAGIC: &[u8; 4] = b"RHA1";
+const HEADER: usize = 16;
+
+/// Attributes of a split's primitives, by local index.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct AttributeBlock {
+    /// Shape number of each primitive.
+    pub shapes: Vec<u32>,
+    /// Shading normals of the three vertices of each primitive, or empty when none has any. Zeros: this one has none.
+    pub normals: Vec<[[f32; 3]; 3]>,
+    /// Texture coordinates of the three vertices of each primitive, or empty when none has any.
+    pub uvs: Vec<[[f32; 2]; 3]>,
+}
+
+/// Why bytes are no attribute block.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum AttributeError {
+    /// Not this format, or another version of it.
+    #[error("this is no attribute block of version 1")]
+    Magic,
+    /// Flags of a later version.
+    #[error("unknown flags {0:#x}")]
+    Flags(u32),
+    /// The header asks for another length.
+    #[error("the header says {expected} bytes, there are {found}")]
+    Length {
+        /// By the header.
+        expected: u64,
+        /// Really.
+        found: u64,
+    },
+    /// The runs do not add up to the number of primitives.
+    #[error("the runs have {found} primitives instead of {expected}")]
+    Runs {
+        /// By the header.
+        expected: u32,
+        /// Sum of the runs.
+        found: u64,
+    },
+}
+
+impl AttributeBlock {
+    /// The block as bytes.
+    ///
+    /// # Panics
+    /// When `normals` or `uvs` is neither empty nor as long as `shapes`: a mistake of the caller.
+    pub fn encode(&self) -> Vec<u8> {
+        let n = self.shapes.len();
+        assert!(self.normals.is_empty() || self.normals.len() == n, "normals for each primitive or none");
+        assert!(self.uvs.is_empty() || self.uvs.len() == n, "texture coordinates for each primitive or none");
+        let runs: Vec<[u32; 2]> = self.shapes.chunk_by(|a, b| a == b).map(|run| [run.len() as u32, run[0]]).collect();
+        let flags = u32::from(!self.normals.is_empty()) | u32::from(!self.uvs.is_empty()) << 1;
+        let mut out = Vec::with_capacity(HEADER + 8 * runs.len() + 36 * self.normals.len() + 24 * self.uvs.len());
+        out.extend(MAGIC);
+        for word in [flags, n as u32, runs.len() as u32] {
+            out.extend(word.to_le_bytes());
+        }
+        for word in runs.as_flattened() {
+            out.extend(word.to_le_bytes());
+        }
+        for x in self.normals.as_flattened().as_flattened().iter().chain(self.uvs.as_flattened().as_flattened()) {
+            out.extend(x.to_le_bytes());
+        }
+        out
+    }
+
+    /// From bytes. Takes memory for what the bytes hold and for `shapes`, whose number is checked against `primitives`, that of the
+    /// geometry beside it.
+    pub fn decode(bytes: &[u8], primitives: u32) -> Result<AttributeBlock, AttributeError> {
+        let word = |at: usize| u32::from_le_bytes([bytes[at], bytes[at + 1], bytes[at + 2], bytes[at + 3]]);
+        if bytes.len() < HEADER || &bytes[..4] != MAGIC {
+            return Err(AttributeError::Magic);
+        }
+        let [flags, n, runs] = [word(4), word(8), word(12)];
+        if flags > 3 {
+            return Err(AttributeError::Flags(flags));
+        }
+        if n != primitives {
+            return Err(AttributeError::Runs { expected: primitives, found: u64::from(n) });
+        }
+        let normals = if flags & 1 != 0 { n as usize } else { 0 };
+        let uvs = if flags & 2 != 0 { n as usize } else { 0 };
+        // each factor is below 2^32 and the sizes below 2^6: no overflow in 64 bits
+        let expected = HEADER as u64 + 8 * u64::from(runs) + 36 * normals as u64 + 24 * uvs as u64;
+        if expected != bytes.len() as u64 {
+            return Err(AttributeError::Length { expected, found: bytes.len() as u64 });
+        }
+        let runs_end = HEADER + 8 * runs as usize;
+        let pairs = || (HEADER..runs_end).step_by(8).map(|at| (word(at), word(at + 4)));
+        let found = pairs().map(|(length, _)| u64::from(length)).sum();
+        if found != u64::from(n) {
+            return Err(AttributeError::Runs { expected: n, found });
+        }
+        let mut shapes = Vec::with_capacity(n as usize);
+        for (length, shape) in pairs() {
+            shapes.resize(shapes.len() + length as usize, shape);
+        }
+        let floats = |at: usize| f32::from_bits(word(at));
+        let normals_end = runs_end + 36 * normals;
+        Ok(AttributeBlock {
+            shapes,
+            normals: (runs_end..normals_end)
+                .step_by(36)
+                .map(|at| std::array::from_fn(|v| std::array::from_fn(|c| floats(at + 12 * v + 4 * c))))
+                .collect(),
+            uvs: (normals_end..bytes.len())
+                .step_by(24)
+                .map(|at| std::array::from_fn(|v| std::array::from_fn(|c| floats(at + 8 * v + 4 * c))))
+                .collect(),
+        })
+    }
+}

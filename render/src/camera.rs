@@ -1,0 +1,63 @@
+//! A perspective pinhole camera with Mitsuba's conventions.
+
+use serde::{Deserialize, Serialize};
+
+/// A pinhole camera, ready to make rays: a point (x, y) of the film in pixels, from the upper left corner, is seen along
+/// `corner + x right + y down`.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Camera {
+    /// The pinhole, in recentred coordinates.
+    pub origin: [f32; 3],
+    /// Direction of the film's upper left corner, not of unit length.
+    pub corner: [f64; 3],
+    /// What one pixel to the right adds.
+    pub right: [f64; 3],
+    /// What one pixel down adds.
+    pub down: [f64; 3],
+}
+
+/// Why a camera cannot be built.
+#[derive(Clone, Copy, Debug, PartialEq, thiserror::Error)]
+pub enum CameraError {
+    /// The field of view is out of range.
+    #[error("field of view {0} degrees is out of range: give more than 0 and less than 180")]
+    FieldOfView(f64),
+    /// The transform does not span space.
+    #[error("the camera's transform is singular or not finite")]
+    Singular,
+}
+
+impl Camera {
+    /// From the rows of the camera-to-world matrix (looking along +z, +y up, +x to the left of the picture), the full field of view
+    /// along x in degrees, the film's size in pixels and the point of the world that is the origin of recentred coordinates.
+    pub fn new(to_world: &[[f64; 4]; 3], fov_x: f64, size: [u32; 2], center: [f64; 3]) -> Result<Camera, CameraError> {
+        if !(fov_x > 0.0 && fov_x < 180.0) {
+            return Err(CameraError::FieldOfView(fov_x));
+        }
+        let column = |c: usize| [to_world[0][c], to_world[1][c], to_world[2][c]];
+        let [x, y, z] = [column(0), column(1), column(2)];
+        let determinant = x[0] * (y[1] * z[2] - y[2] * z[1]) - y[0] * (x[1] * z[2] - x[2] * z[1])
+            + z[0] * (x[1] * y[2] - x[2] * y[1]);
+        let origin: [f32; 3] = std::array::from_fn(|i| (to_world[i][3] - center[i]) as f32);
+        if determinant == 0.0 || !determinant.is_finite() || origin.iter().any(|o| !o.is_finite()) {
+            return Err(CameraError::Singular);
+        }
+        let [width, height] = size.map(f64::from);
+        let half_x = libm::tan(fov_x.to_radians() * 0.5);
+        let half_y = half_x * height / width;
+        Ok(Camera {
+            origin,
+            corner: std::array::from_fn(|i| z[i] + x[i] * half_x + y[i] * half_y),
+            right: std::array::from_fn(|i| -x[i] * (2.0 * half_x / width)),
+            down: std::array::from_fn(|i| -y[i] * (2.0 * half_y / height)),
+        })
+    }
+
+    /// Unit direction through the point (x, y) of the film, in pixels from its upper left corner.
+    #[inline(always)]
+    pub fn direction(&self, x: f64, y: f64) -> [f32; 3] {
+        let d: [f64; 3] = std::array::from_fn(|i| self.corner[i] + x * self.right[i] + y * self.down[i]);
+        let scale = 1.0 / (d[0] * d[0] + d[1] * d[1] + d[2] * d[2]).sqrt();
+        d.map(|c| (c * scale) as f32)
+    }
+}

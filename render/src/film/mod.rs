@@ -1,0 +1,164 @@
+//! The film: exact sums, so that order is nothing.
+//!
+//! A contribution becomes fixed point of 2^-64 in an `i128` (bits of a float below 2^-64 are cut off, always the same ones), and integers
+//! add in any order. Each pixel has two halves, the even and the odd samples. A film holds only the tiles of 32 x 32 pixels that were
+//! touched; a task commits its [`FilmPart`], and parts merge by adding.
+//!
+//! A contribution that is not finite, is negative, or is 2^38 or more is not added: it is counted, and the smallest
+//! [`KEPT_KEYS`] of the (pixel, sample) that made one are kept to replay them. Sums stay exact below 2^63 per pixel and half.
+
+mod code;
+mod resolve;
+#[cfg(test)]
+mod tests;
+
+use std::collections::BTreeSet;
+
+pub use code::FilmError;
+
+/// Width and height of a tile in pixels.
+pub const TILE: u32 = 32;
+/// How many keys of rejected contributions are kept.
+pub const KEPT_KEYS: usize = 16;
+
+/// Contributions of this size and above are rejected.
+const LIMIT: f32 = 274_877_906_944.0; // 2^38
+
+/// Sums of one pixel: by half, by channel.
+type Sums = [[i128; 3]; 2];
+
+/// Sums of one tile, row by row.
+#[derive(Clone, PartialEq, Eq, Debug)]
+struct Tile(Box<[Sums]>);
+
+impl Tile {
+    fn new() -> Tile {
+        Tile(vec![[[0; 3]; 2]; (TILE * TILE) as usize].into_boxed_slice())
+    }
+}
+
+/// A film, or the part of one that some task filled.
+#[derive(Clone, PartialEq, Eq, Debug)]
+pub struct FilmPart {
+    size: [u32; 2],
+    tiles: Vec<Option<Tile>>,
+    rejected: Rejected,
+}
+
+/// Contributions that were not added.
+#[derive(Clone, Default, PartialEq, Eq, Debug)]
+pub struct Rejected {
+    /// How many.
+    pub count: u64,
+    /// The smallest (pixel, sample) among them, at most [`KEPT_KEYS`].
+    pub keys: BTreeSet<(u32, u32)>,
+}
+
+impl Rejected {
+    fn insert(&mut self, key: (u32, u32)) {
+        self.keys.insert(key);
+        if self.keys.len() > KEPT_KEYS {
+            self.keys.pop_last();
+        }
+    }
+}
+
+impl FilmPart {
+    /// An empty film of `size` pixels, each way from 1 to 65535.
+    pub fn new(size: [u32; 2]) -> FilmPart {
+        let tiles = size[0].div_ceil(TILE) as usize * size[1].div_ceil(TILE) as usize;
+        FilmPart { size, tiles: vec![None; tiles], rejected: Rejected::default() }
+    }
+
+    /// Width and height in pixels.
+    pub fn size(&self) -> [u32; 2] {
+        self.size
+    }
+
+    /// What was not added.
+    pub fn rejected(&self) -> &Rejected {
+        &self.rejected
+    }
+
+    /// Tiles that were touched.
+    pub fn touched(&self) -> usize {
+        self.tiles.iter().flatten().count()
+    }
+
+    /// Memory of the sums in bytes.
+    pub fn memory(&self) -> usize {
+        self.touched() * (TILE * TILE) as usize * size_of::<Sums>() + self.tiles.len() * size_of::<Option<Tile>>()
+    }
+
+    /// Adds a contribution to pixel `y * width + x` (below width * height).
+    #[inline]
+    pub fn add(&mut self, pixel: u32, sample: u32, value: [f32; 3]) {
+        // false for NaN too; -0 passes and adds nothing
+        if !value.iter().all(|&x| (0.0..LIMIT).contains(&x)) {
+            self.reject(pixel, sample);
+            return;
+        }
+        let (x, y) = (pixel % self.size[0], pixel / self.size[0]);
+        let tile = (y / TILE * self.size[0].div_ceil(TILE) + x / TILE) as usize;
+        let sums = &mut self.tiles[tile].get_or_insert_with(Tile::new).0[(y % TILE * TILE + x % TILE) as usize];
+        for (sum, x) in sums[(sample & 1) as usize].iter_mut().zip(value) {
+            *sum = sum.wrapping_add(fixed(x));
+        }
+    }
+
+    #[cold]
+    fn reject(&mut self, pixel: u32, sample: u32) {
+        self.rejected.count += 1;
+        self.rejected.insert((pixel, sample));
+    }
+
+    /// Adds another part of the same film.
+    pub fn merge(&mut self, other: &FilmPart) -> Result<(), FilmError> {
+        if self.size != other.size {
+            return Err(FilmError::Size { expected: self.size, found: other.size });
+        }
+        for (mine, theirs) in self.tiles.iter_mut().zip(&other.tiles) {
+            let Some(theirs) = theirs else { continue };
+            let Some(mine) = mine else {
+                *mine = Some(theirs.clone());
+                continue;
+            };
+            for (a, b) in
+                mine.0.as_flattened_mut().as_flattened_mut().iter_mut().zip(theirs.0.as_flattened().as_flattened())
+            {
+                *a = a.wrapping_add(*b);
+            }
+        }
+        self.rejected.count += other.rejected.count;
+        for &key in &other.rejected.keys {
+            self.rejected.insert(key);
+        }
+        Ok(())
+    }
+
+    fn sums(&self, x: u32, y: u32) -> &Sums {
+        const NONE: Sums = [[0; 3]; 2];
+        match &self.tiles[(y / TILE * self.size[0].div_ceil(TILE) + x / TILE) as usize] {
+            Some(tile) => &tile.0[(y % TILE * TILE + x % TILE) as usize],
+            None => &NONE,
+        }
+    }
+}
+
+/// A float in [0, 2^38) in units of 2^-64, cut off towards 0.
+#[inline(always)]
+fn fixed(x: f32) -> i128 {
+    let bits = x.to_bits();
+    let exponent = (bits >> 23 & 255) as i32;
+    // subnormals are far below 2^-64
+    let mantissa = u64::from(bits & 0x7f_ffff | 0x80_0000);
+    // x = mantissa 2^(exponent - 150); a shift of at most 24 to the right keeps any bit, one of 78 to the left is the most below 2^38
+    let shift = exponent - 150 + 64;
+    if shift >= 0 {
+        (u128::from(mantissa) << shift) as i128
+    } else if shift > -24 {
+        i128::from(mantissa >> -shift)
+    } else {
+        0
+    }
+}

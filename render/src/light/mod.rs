@@ -1,0 +1,216 @@
+//! Light sources: choosing one, a point on it, and the density with which that happens.
+//!
+//! A primitive that emits is chosen with a probability that does not depend on where it is seen from: its shape's share times its share of the
+//! shape's area. Nine tenths of the shapes' shares go by power (luminance x area x pi), one tenth is dealt evenly. The probabilities are
+//! multiples of 2^-32, a cumulative table of integers, so one 32-bit number chooses exactly by them and both sides of MIS see the same ones.
+//! A primitive whose share is below 2^-32 is never chosen; its density is 0, and MIS leaves it to the BSDF.
+
+mod sphere;
+#[cfg(test)]
+mod tests;
+mod triangle;
+
+use glam::Vec3;
+
+use crate::math::luminance;
+use crate::ray::PrimId;
+use crate::world::{Primitive, World};
+pub use sphere::SphereLight;
+pub use triangle::TriangleLight;
+
+/// Share of the choice that is dealt evenly over the sources.
+const EVEN: f64 = 0.1;
+/// Most that the sky is chosen when there are other sources.
+const SKY_LIMIT: f64 = 0.5;
+
+/// Tables of every source of a world.
+#[derive(Clone, Debug)]
+pub struct Lights {
+    sources: Vec<Source>,
+    /// Upper ends of the sources' intervals of 32-bit numbers; the last is 2^32.
+    ends: Vec<u64>,
+    /// By ascending id: the primitive's number in `sources`.
+    by_prim: Vec<(PrimId, u32)>,
+    sky: Option<Vec3>,
+    sky_probability: f32,
+}
+
+/// One primitive, or the sky.
+#[derive(Clone, Debug)]
+struct Source {
+    geometry: Geometry,
+    emission: Vec3,
+    /// With which it is chosen; what the integers in `Lights::ends` say.
+    probability: f32,
+}
+
+#[derive(Clone, Debug)]
+enum Geometry {
+    Triangle(TriangleLight),
+    Sphere(SphereLight),
+    Sky,
+}
+
+/// A direction towards a source.
+#[derive(Clone, Copy, Debug)]
+pub struct LightSample {
+    /// Unit direction from the point lit.
+    pub d: Vec3,
+    /// Nothing nearer than this may be met; smaller than the distance of the source by the error of both.
+    pub tmax: f32,
+    /// Radiance arriving from there if nothing is in between.
+    pub radiance: Vec3,
+    /// Density in solid angle, the choice included.
+    pub pdf: f32,
+}
+
+impl Lights {
+    /// Tables for a world. Primitives without area and emission of zero are left out.
+    pub fn new(world: &World) -> Lights {
+        let mut sources = Vec::new();
+        let mut by_prim = Vec::new();
+        let mut areas = vec![0.0f64; world.shapes.len()];
+        let mut chosen = Vec::new();
+        for e in &world.emissive {
+            let Some(emission) = world.shapes.get(e.shape as usize).and_then(|s| s.emission).map(Vec3::from) else {
+                continue;
+            };
+            let geometry = match e.geometry {
+                Primitive::Triangle(v) => Geometry::Triangle(TriangleLight::new(v)),
+                Primitive::Sphere { center, radius, flipped } => {
+                    Geometry::Sphere(SphereLight::new(center, radius, flipped))
+                }
+            };
+            let area = f64::from(geometry.area());
+            if !(area > 0.0 && area.is_finite() && luminance(emission) > 0.0) {
+                continue;
+            }
+            areas[e.shape as usize] += area;
+            by_prim.push((e.prim, sources.len() as u32));
+            chosen.push((e.shape as usize, area));
+            sources.push(Source { geometry, emission, probability: 0.0 });
+        }
+        by_prim.sort_unstable();
+        let sky = world.environment.map(Vec3::from).filter(|c| luminance(*c) > 0.0);
+        let power =
+            |shape: usize| world.shapes[shape].emission.map_or(0.0, |e| f64::from(luminance(e.into()))) * areas[shape];
+        let shapes: Vec<usize> = (0..areas.len()).filter(|&s| areas[s] > 0.0).collect();
+        let total: f64 = shapes.iter().map(|&s| power(s)).sum();
+        let sky_share = sky.map_or(0.0, |c| sky_share(c, world, total, shapes.len()));
+        let mut weights: Vec<f64> = chosen
+            .iter()
+            .map(|&(s, area)| {
+                let share = (1.0 - EVEN) * power(s) / total + EVEN / shapes.len() as f64;
+                (1.0 - sky_share) * share * area / areas[s]
+            })
+            .collect();
+        if let Some(emission) = sky {
+            weights.push(sky_share);
+            sources.push(Source { geometry: Geometry::Sky, emission, probability: 0.0 });
+        }
+        let ends = integer_ends(&weights);
+        let mut start = 0;
+        for (source, &end) in sources.iter_mut().zip(&ends) {
+            source.probability = ((end - start) as f64 / 4_294_967_296.0) as f32;
+            start = end;
+        }
+        let sky_probability = sky.map_or(0.0, |_| sources.last().map_or(0.0, |s| s.probability));
+        Lights { sources, ends, by_prim, sky, sky_probability }
+    }
+
+    /// Whether there is nothing to sample.
+    pub fn is_empty(&self) -> bool {
+        self.sources.is_empty()
+    }
+
+    /// Radiance of the sky, 0 if there is none.
+    pub fn sky(&self) -> Vec3 {
+        self.sky.unwrap_or(Vec3::ZERO)
+    }
+
+    /// A direction from `o` to a source, by a number for the choice and two in [0, 1) for the place. `None` when what was chosen shows
+    /// `o` its back: that sample is worth 0.
+    #[inline]
+    pub fn sample(&self, o: Vec3, choice: u32, u: [f32; 2]) -> Option<LightSample> {
+        let i = self.choose(choice)?;
+        let source = &self.sources[i];
+        let (d, tmax, pdf) = match &source.geometry {
+            Geometry::Triangle(t) => t.sample(o, u)?,
+            Geometry::Sphere(s) => s.sample(o, u)?,
+            Geometry::Sky => (sphere::uniform(u), f32::INFINITY, sphere::UNIFORM_PDF),
+        };
+        Some(LightSample { d, tmax, radiance: source.emission, pdf: pdf * source.probability })
+    }
+
+    /// Density of [`Lights::sample`], from `o`, in the direction `d` that met the front of primitive `prim` at distance `t`, where the cosine
+    /// between the source's normal and the way back is `cos`. 0 for what is never sampled.
+    #[inline]
+    pub fn pdf(&self, prim: PrimId, o: Vec3, t: f32, cos: f32) -> f32 {
+        let Ok(i) = self.by_prim.binary_search_by_key(&prim, |e| e.0) else { return 0.0 };
+        let source = &self.sources[self.by_prim[i].1 as usize];
+        let pdf = match &source.geometry {
+            Geometry::Triangle(s) => s.pdf(t, cos),
+            Geometry::Sphere(s) => s.pdf(o, t, cos),
+            Geometry::Sky => 0.0,
+        };
+        pdf * source.probability
+    }
+
+    /// Density of [`Lights::sample`] in a direction that meets nothing.
+    #[inline]
+    pub fn sky_pdf(&self) -> f32 {
+        self.sky_probability * sphere::UNIFORM_PDF
+    }
+
+    /// The source in whose interval the number lies.
+    #[inline]
+    fn choose(&self, number: u32) -> Option<usize> {
+        let i = match self.ends.len() {
+            0 => return None,
+            // few: count the ends passed, without branches to mispredict
+            n if n <= 8 => self.ends.iter().filter(|&&end| end <= u64::from(number)).count(),
+            _ => self.ends.partition_point(|&end| end <= u64::from(number)),
+        };
+        (i < self.ends.len()).then_some(i)
+    }
+}
+
+impl Geometry {
+    fn area(&self) -> f32 {
+        match self {
+            Geometry::Triangle(t) => t.area(),
+            Geometry::Sphere(s) => s.area(),
+            Geometry::Sky => 0.0,
+        }
+    }
+}
+
+/// The sky's share of the choice: all when it is alone, else by the power that enters the scene's bounding sphere, but at most
+/// [`SKY_LIMIT`] (a sky outside a closed room would take every sample).
+fn sky_share(sky: Vec3, world: &World, others: f64, shapes: usize) -> f64 {
+    if shapes == 0 {
+        return 1.0;
+    }
+    let diagonal: f64 = (0..3).map(|i| f64::from(world.hi[i] - world.lo[i]).powi(2)).sum();
+    // pi L x pi R^2 against pi L x area
+    let power = f64::from(luminance(sky)) * std::f64::consts::PI * diagonal / 4.0;
+    let share = (1.0 - EVEN) * power / (power + others) + EVEN / (shapes + 1) as f64;
+    if share < SKY_LIMIT { share } else { SKY_LIMIT }
+}
+
+/// Upper ends of consecutive intervals of [0, 2^32) in proportion to the weights; the last nonzero one ends at 2^32.
+fn integer_ends(weights: &[f64]) -> Vec<u64> {
+    let total: f64 = weights.iter().sum();
+    let mut sum = 0.0;
+    let mut ends: Vec<u64> = weights
+        .iter()
+        .map(|w| {
+            sum += w;
+            ((sum / total * 4_294_967_296.0) as u64).min(1 << 32)
+        })
+        .collect();
+    if let Some(last) = ends.last_mut() {
+        *last = 1 << 32;
+    }
+    ends
+}

@@ -1,0 +1,72 @@
+//! A triangle that emits evenly from its front.
+
+use glam::Vec3;
+
+use crate::math::gamma;
+
+/// A triangle, sampled uniformly by area.
+#[derive(Clone, Copy, Debug)]
+pub struct TriangleLight {
+    p0: Vec3,
+    e1: Vec3,
+    e2: Vec3,
+    /// Unit normal of the front; its cosine is taken with it.
+    normal: Vec3,
+    area: f32,
+    /// Bound of the error of a sampled point, as a length.
+    error: f32,
+}
+
+/// Error of a direction: what snapping and normalising turn it by, in radians (the former below 1e-7, the latter below gamma(3)).
+const TURN: f32 = 1e-7 + gamma(3);
+
+impl TriangleLight {
+    /// From its vertices, counter-clockwise from the front.
+    pub fn new(v: [[f32; 3]; 3]) -> TriangleLight {
+        let v = v.map(Vec3::from);
+        let (e1, e2) = (v[1] - v[0], v[2] - v[0]);
+        // in f64: the cross product of a thin triangle cancels
+        let n = e1.as_dvec3().cross(e2.as_dvec3());
+        let length = n.length();
+        let bound = v[0].abs().max(v[1].abs()).max(v[2].abs());
+        TriangleLight {
+            p0: v[0],
+            e1,
+            e2,
+            normal: if length > 0.0 { (n / length).as_vec3() } else { Vec3::ZERO },
+            area: (0.5 * length) as f32,
+            error: bound.length() * gamma(8),
+        }
+    }
+
+    /// Area.
+    pub fn area(&self) -> f32 {
+        self.area
+    }
+
+    /// Direction from `o`, limit of the shadow ray, density in solid angle.
+    #[inline(always)]
+    pub(super) fn sample(&self, o: Vec3, u: [f32; 2]) -> Option<(Vec3, f32, f32)> {
+        let root = u[0].sqrt();
+        let p = self.p0 + self.e1 * (root * (1.0 - u[1])) + self.e2 * (root * u[1]);
+        let way = p - o;
+        let distance2 = way.length_squared();
+        let distance = distance2.sqrt();
+        let d = way / distance;
+        let cos = -d.dot(self.normal);
+        if !(cos > 0.0 && distance2.is_finite()) {
+            return None;
+        }
+        // The ray meets the light's plane nearer than the point by at most (error of the points) / cos + (turn) x distance x tan; the
+        // ray test's own error grows with the light's distance and size (see math::offset).
+        let origin_error = o.abs().max_element() * gamma(4);
+        let slack = (self.error + origin_error + distance * TURN) / cos + distance * gamma(24);
+        Some((d, (distance - slack).max(0.0), distance2 / (cos * self.area)))
+    }
+
+    /// Density in solid angle of the direction that met the front at distance `t` and cosine `cos`.
+    #[inline(always)]
+    pub(super) fn pdf(&self, t: f32, cos: f32) -> f32 {
+        t * t / (cos * self.area)
+    }
+}

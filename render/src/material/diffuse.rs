@@ -1,0 +1,25 @@
+//! Lambertian reflection.
+
+use std::f32::consts::FRAC_1_PI;
+
+use glam::Vec3;
+
+use super::Scatter;
+use crate::math::concentric_disk;
+
+#[inline(always)]
+pub(super) fn eval(reflectance: [f32; 3], wo: Vec3, wi: Vec3) -> Scatter {
+    if !(wo.z > 0.0 && wi.z > 0.0) {
+        return Scatter::NONE;
+    }
+    let pdf = wi.z * FRAC_1_PI;
+    Scatter { value: Vec3::from(reflectance) * pdf, pdf }
+}
+
+/// Cosine-weighted (Malley's method).
+#[inline(always)]
+pub(super) fn sample(wo: Vec3, u: [f32; 2]) -> Option<Vec3> {
+    let [x, y] = concentric_disk(u);
+    let z2 = 1.0 - x * x - y * y;
+    (wo.z > 0.0 && z2 > 0.0).then(|| Vec3::new(x, y, z2.sqrt()))
+}

@@ -1,0 +1,25 @@
+//! Small mathematics that is the same bits on every machine: directions, frames, error bounds, hashes, sine and cosine.
+
+mod dir;
+mod frame;
+pub mod hash;
+mod offset;
+mod trig;
+
+pub use dir::UnitDir;
+pub use frame::Basis;
+pub use offset::{Position, gamma, offset_origin};
+pub use trig::{concentric_disk, sincos_turn};
+
+use glam::Vec3;
+
+/// Luminance of linear Rec. 709.
+pub fn luminance(c: Vec3) -> f32 {
+    0.2126 * c.x + 0.7152 * c.y + 0.0722 * c.z
+}
+
+/// Maps 32 random bits to [0, 1): the upper 24, so that 1 is never reached.
+#[inline(always)]
+pub fn unit(bits: u32) -> f32 {
+    (bits >> 8) as f32 * (1.0 / 16_777_216.0)
+}

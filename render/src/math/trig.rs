@@ -1,0 +1,39 @@
+//! Sine and cosine of fractions of a turn, and the disk map that needs them: own polynomials, plain f32 operations.
+
+use std::f32::consts::{FRAC_PI_2, FRAC_PI_4};
+
+/// `(sin x, cos x)` for `|x| <= pi / 4`: Taylor polynomials to x^9 and x^8, remainders 4e-9 and 3e-8 times the first
+/// missing term at the end; with rounding below 1.2e-7.
+#[inline(always)]
+fn sincos_small(x: f32) -> (f32, f32) {
+    let z = x * x;
+    let s = x + x * z * (-1.666_666_7e-1 + z * (8.333_333e-3 + z * (-1.984_127e-4 + z * 2.755_732e-6)));
+    let c = 1.0 + z * (-0.5 + z * (4.166_666_8e-2 + z * (-1.388_888_9e-3 + z * 2.480_158_7e-5)));
+    (s, c)
+}
+
+/// `(sin 2 pi u, cos 2 pi u)` for u in [0, 1], absolute error below 2e-7.
+#[inline(always)]
+pub fn sincos_turn(u: f32) -> (f32, f32) {
+    let q = (u * 4.0 + 0.5) as i32;
+    let (s, c) = sincos_small((u - q as f32 * 0.25) * (4.0 * FRAC_PI_2));
+    match q & 3 {
+        0 => (s, c),
+        1 => (c, -s),
+        2 => (-s, -c),
+        _ => (-c, s),
+    }
+}
+
+/// The unit square onto the unit disk, keeping areas and strata (Shirley and Chiu 1997).
+#[inline(always)]
+pub fn concentric_disk(u: [f32; 2]) -> [f32; 2] {
+    let (x, y) = (2.0 * u[0] - 1.0, 2.0 * u[1] - 1.0);
+    let wide = x.abs() > y.abs();
+    let (r, q) = if wide { (x, y) } else { (y, x) };
+    if r == 0.0 {
+        return [0.0, 0.0];
+    }
+    let (s, c) = sincos_small(FRAC_PI_4 * (q / r));
+    if wide { [r * c, r * s] } else { [r * s, r * c] }
+}

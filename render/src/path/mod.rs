@@ -1,0 +1,185 @@
+//! One step of a batch of paths: hits in; contributions, shadow rays and next rays out.
+//!
+//! Unidirectional path tracing with next-event estimation and multiple importance sampling (power heuristic), Russian roulette by
+//! throughput, and splitting at the first hit. What a ray becomes is a function of (frame, world, ray, hit) alone: neither the batch it is
+//! in nor its neighbours matter.
+
+mod interaction;
+pub mod reference;
+mod shade;
+#[cfg(test)]
+mod tests;
+
+use bytemuck::{Pod, Zeroable};
+use glam::Vec3;
+
+use crate::frame::Frame;
+use crate::light::Lights;
+use crate::math::UnitDir;
+use crate::ray::{Hit, PathKey, PrimId, Ray};
+use crate::sampler::Stream;
+use crate::world::{Primitive, World};
+
+pub use shade::shade;
+
+/// A ray looking for the nearest hit, with what its path needs to go on. 48 bytes.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, PartialEq, Pod, Zeroable)]
+pub struct PathRay {
+    /// Origin, in recentred coordinates, already off the surface it left.
+    pub o: [f32; 3],
+    /// Direction.
+    pub dir: UnitDir,
+    /// Which path, which vertex.
+    pub key: PathKey,
+    /// What radiance found along this ray counts for in the picture.
+    pub throughput: [f32; 3],
+    /// Density in solid angle with which the BSDF gave this direction; 0 for a camera ray or a mirror, which nothing else samples.
+    pub pdf: f32,
+}
+
+/// A ray that only asks whether something is in the way. 48 bytes.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, PartialEq, Pod, Zeroable)]
+pub struct ShadowRay {
+    /// Origin, in recentred coordinates, already off the surface it left.
+    pub o: [f32; 3],
+    /// Direction, of unit length.
+    pub dir: UnitDir,
+    /// Hits beyond do not count.
+    pub tmax: f32,
+    /// What to add to the picture when nothing is in the way.
+    pub contribution: [f32; 3],
+    /// Which path; `vertex` is that of the ray that hit the surface this one leaves.
+    pub key: PathKey,
+}
+
+impl PathRay {
+    /// For the kernel.
+    #[inline(always)]
+    pub fn ray(&self) -> Ray {
+        Ray { o: self.o, tmin: 0.0, d: self.dir.decode(), tmax: f32::INFINITY }
+    }
+}
+
+impl ShadowRay {
+    /// For the kernel.
+    #[inline(always)]
+    pub fn ray(&self) -> Ray {
+        Ray { o: self.o, tmin: 0.0, d: self.dir.decode(), tmax: self.tmax }
+    }
+
+    /// What to add to the film when nothing is in the way.
+    #[inline(always)]
+    pub fn light(&self) -> Contribution {
+        Contribution { pixel: self.key.pixel, sample: self.key.sample, value: self.contribution }
+    }
+}
+
+/// Light for the film.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, PartialEq, Pod, Zeroable)]
+pub struct Contribution {
+    /// y * width + x.
+    pub pixel: u32,
+    /// Index of the sample.
+    pub sample: u32,
+    /// Radiance times throughput.
+    pub value: [f32; 3],
+}
+
+/// The primitive that was hit, with its attributes.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Surface {
+    /// Its global id.
+    pub prim: PrimId,
+    /// Its shape.
+    pub shape: u32,
+    /// Where it is.
+    pub geometry: Primitive,
+    /// Shading normals of a triangle's vertices; all zero for none.
+    pub normals: Option<[[f32; 3]; 3]>,
+    /// Texture coordinates of a triangle's vertices.
+    pub uv: Option<[[f32; 2]; 3]>,
+}
+
+/// Where hits get their surfaces from: the splits in memory.
+pub trait Surfaces {
+    /// The surface of the hit (never a miss) of ray `index` of the batch.
+    fn surface(&self, index: usize, hit: &Hit) -> Surface;
+}
+
+/// What every path shares.
+#[derive(Clone, Copy, Debug)]
+pub struct Context<'a> {
+    /// Materials, shapes, sky.
+    pub world: &'a World,
+    /// The world's sources.
+    pub lights: &'a Lights,
+    /// The picture.
+    pub frame: &'a Frame,
+}
+
+/// What a batch became. Vectors are appended to, in the order of the rays; clear and use again.
+#[derive(Clone, Debug, Default)]
+pub struct Outcome {
+    /// For the film.
+    pub light: Vec<Contribution>,
+    /// To be traced until anything is hit.
+    pub shadow: Vec<ShadowRay>,
+    /// To be traced to the nearest hit.
+    pub next: Vec<PathRay>,
+    /// What happened.
+    pub counters: Counters,
+}
+
+impl Outcome {
+    /// Empties the vectors and keeps their memory and the counters.
+    pub fn clear(&mut self) {
+        self.light.clear();
+        self.shadow.clear();
+        self.next.clear();
+    }
+}
+
+/// Counts of what happened to rays.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Counters {
+    /// Rays shaded.
+    pub shaded: u64,
+    /// Of them, those that left the scene.
+    pub missed: u64,
+    /// Paths ended by Russian roulette.
+    pub roulette: u64,
+    /// Paths ended at the largest depth.
+    pub depth: u64,
+    /// Paths ended because nothing is reflected: black, the back of a one-sided surface, a direction below the surface.
+    pub absorbed: u64,
+}
+
+impl Counters {
+    /// Adds another's counts.
+    pub fn add(&mut self, other: &Counters) {
+        self.shaded += other.shaded;
+        self.missed += other.missed;
+        self.roulette += other.roulette;
+        self.depth += other.depth;
+        self.absorbed += other.absorbed;
+    }
+}
+
+/// The camera ray of a sample (below 2^24) of pixel `y * width + x`.
+#[inline]
+pub fn camera_ray(frame: &Frame, pixel: u32, sample: u32) -> PathRay {
+    let [width, _] = frame.size;
+    let [u, v] = Stream::new(frame.seed, pixel, sample).film();
+    let x = f64::from(pixel % width) + 0.5 + frame.filter.offset(u);
+    let y = f64::from(pixel / width) + 0.5 + frame.filter.offset(v);
+    PathRay {
+        o: frame.camera.origin,
+        dir: UnitDir::encode(frame.camera.direction(x, y)),
+        key: PathKey { pixel, sample, branch: 0, vertex: 0 },
+        throughput: Vec3::ONE.to_array(),
+        pdf: 0.0,
+    }
+}
