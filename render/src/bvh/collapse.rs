@@ -1,0 +1,287 @@
+//! From a binary tree to the 8-wide tree of least expected cost, written in the layout of [`super::layout`].
+//!
+//! Ylitie, Karras, Laine, "Efficient Incoherent Ray Traversal on GPUs Through Compressed Wide BVHs" (2017), section 3.2:
+//! the least cost of each binary subtree as a forest of at most 1..8 roots, by dynamic programming from below.
+
+use std::sync::atomic::{AtomicU32, Ordering};
+
+use super::Fork;
+use super::layout::{Aabb, NODE_ALIGN, NODE_BYTES, WIDTH, node_ref, write_slot};
+use super::sah::{BinaryNode, BinaryTree};
+
+/// Costs in units of a node visit; measured to be flat around these values.
+const NODE_COST: f32 = 1.0;
+const LEAF_COST: f32 = 1.0;
+const PRIMITIVE_COST: f32 = 0.1;
+/// Below this many boxes a subtree is done by one thread.
+const FORK_ABOVE: u32 = 1 << 14;
+
+/// What the boxes of a tree stand for.
+pub(super) trait Content: Sync {
+    /// How many boxes may share a leaf.
+    fn max_leaf(&self) -> u32;
+    /// Bytes that the record of a leaf of n boxes takes, a multiple of 32.
+    fn leaf_bytes(&self, n: usize) -> usize;
+    /// Stack entries that a traversal of what stands below a leaf needs.
+    fn stack_below(&self, boxes: &[u32]) -> usize;
+    /// Writes the record of a leaf with these boxes, and returns the reference to it; `at` is the offset of `out`.
+    fn write_leaf(&self, boxes: &[u32], out: &mut [u8], at: usize) -> u32;
+}
+
+/// An 8-wide tree that has been decided on but not written.
+pub(super) struct Plan<'a, C> {
+    tree: &'a BinaryTree,
+    content: &'a C,
+    fork: &'a dyn Fork,
+    /// Per binary node; see [`choose`].
+    choices: Vec<Choice>,
+    /// Bytes / 64 of the subtree, for each binary node that becomes an 8-wide one.
+    sizes: Vec<AtomicU32>,
+    /// Bytes of all of it, a multiple of 64.
+    pub bytes: usize,
+    /// Entries that a traversal's stack can hold at most.
+    pub stack: usize,
+}
+
+/// How a binary node is best replaced: `[0]` is 1 when, as a single root, it is an inner node and 0 when it is a leaf;
+/// `[j]` for a forest of at most j + 1 roots: how many of them the first child gets, with [`FEWER`] set when j are as good.
+type Choice = [u8; WIDTH];
+const FEWER: u8 = 0x80;
+
+impl<'a, C: Content> Plan<'a, C> {
+    /// Decides.
+    pub fn new(tree: &'a BinaryTree, content: &'a C, fork: &'a dyn Fork) -> Self {
+        let mut choices = vec![[0; WIDTH]; tree.nodes.len()];
+        let (root, below) = choices.split_first_mut().expect("a tree has a root");
+        Chooser { nodes: &tree.nodes, max_leaf: content.max_leaf(), fork }.costs(0, root, below);
+        let mut sizes = Vec::new();
+        sizes.resize_with(tree.nodes.len(), AtomicU32::default);
+        let mut plan = Plan { tree, content, fork, choices, sizes, bytes: 0, stack: 0 };
+        (plan.bytes, plan.stack) = plan.measure(Part { node: 0, first: 0 });
+        plan
+    }
+
+    /// Writes the tree into `out` of exactly [`Plan::bytes`] zeros, which lie at offset `at` of the arena: the root's box.
+    pub fn write(&self, out: &mut [u8], at: usize) -> Aabb {
+        self.write_subtree(Part { node: 0, first: 0 }, out, at);
+        self.tree.nodes[0].aabb
+    }
+
+    /// Bytes and stack entries of the subtree.
+    fn measure(&self, part: Part) -> (usize, usize) {
+        let children = self.children(part);
+        let others = children.len() - 1;
+        let mut stack = children.len();
+        let mut bytes = NODE_BYTES;
+        let mut inner = Parts::default();
+        for &child in children.iter() {
+            if self.is_inner(child) {
+                inner.push(child);
+            } else {
+                let boxes = self.boxes(child);
+                bytes += self.content.leaf_bytes(boxes.len());
+                stack = stack.max(others + self.content.stack_below(boxes));
+            }
+        }
+        let below = self.measure_all(&inner);
+        bytes = bytes.next_multiple_of(NODE_ALIGN) + below.0;
+        self.sizes[part.node as usize].store((bytes / NODE_ALIGN) as u32, Ordering::Relaxed);
+        (bytes, stack.max(others + below.1))
+    }
+
+    /// Sum of the bytes and the most stack entries of some subtrees.
+    fn measure_all(&self, parts: &[Part]) -> (usize, usize) {
+        match parts {
+            [] => (0, 0),
+            &[part] => self.measure(part),
+            _ => {
+                let (left, right) = parts.split_at(parts.len() / 2);
+                let (mut a, mut b) = ((0, 0), (0, 0));
+                self.both(parts, &mut || a = self.measure_all(left), &mut || b = self.measure_all(right));
+                (a.0 + b.0, a.1.max(b.1))
+            }
+        }
+    }
+
+    fn write_subtree(&self, part: Part, out: &mut [u8], at: usize) {
+        let children = self.children(part);
+        let mut used = NODE_BYTES;
+        for (slot, &child) in children.iter().enumerate() {
+            if !self.is_inner(child) {
+                let boxes = self.boxes(child);
+                let bytes = self.content.leaf_bytes(boxes.len());
+                let reference = self.content.write_leaf(boxes, &mut out[used..used + bytes], at + used);
+                write_slot(out, 0, slot, &self.node(child).aabb, reference);
+                used += bytes;
+            }
+        }
+        used = used.next_multiple_of(NODE_ALIGN);
+        let (own, below) = out.split_at_mut(used);
+        let mut inner = Parts::default();
+        let mut next = at + used;
+        for (slot, &child) in children.iter().enumerate() {
+            if self.is_inner(child) {
+                write_slot(own, 0, slot, &self.node(child).aabb, node_ref(next));
+                next += self.bytes_of(child);
+                inner.push(child);
+            }
+        }
+        for slot in children.len()..WIDTH {
+            write_slot(own, 0, slot, &Aabb::EMPTY, 0);
+        }
+        self.write_all(&inner, below, at + used);
+    }
+
+    fn write_all(&self, parts: &[Part], out: &mut [u8], at: usize) {
+        match parts {
+            [] => {}
+            &[part] => self.write_subtree(part, out, at),
+            _ => {
+                let (left, right) = parts.split_at(parts.len() / 2);
+                let bytes = left.iter().map(|&p| self.bytes_of(p)).sum();
+                let (a, b) = out.split_at_mut(bytes);
+                self.both(parts, &mut || self.write_all(left, a, at), &mut || self.write_all(right, b, at + bytes));
+            }
+        }
+    }
+
+    /// Runs both, in parallel when the parts are large.
+    fn both(&self, parts: &[Part], a: &mut (dyn FnMut() + Send), b: &mut (dyn FnMut() + Send)) {
+        if parts.iter().map(|&p| self.node(p).count).sum::<u32>() > FORK_ABOVE {
+            self.fork.join(a, b);
+        } else {
+            a();
+            b();
+        }
+    }
+
+    fn node(&self, part: Part) -> &BinaryNode {
+        &self.tree.nodes[part.node as usize]
+    }
+    fn is_inner(&self, part: Part) -> bool {
+        self.choices[part.node as usize][0] == 1
+    }
+    fn bytes_of(&self, part: Part) -> usize {
+        self.sizes[part.node as usize].load(Ordering::Relaxed) as usize * NODE_ALIGN
+    }
+    fn boxes(&self, part: Part) -> &[u32] {
+        &self.tree.order[part.first as usize..][..self.node(part).count as usize]
+    }
+
+    /// The roots that become the children of an 8-wide node.
+    fn children(&self, part: Part) -> Parts {
+        let mut out = Parts::default();
+        if self.is_inner(part) {
+            self.roots(part, WIDTH - 1, true, &mut out);
+        } else {
+            // the whole tree is one leaf
+            out.push(part);
+        }
+        out
+    }
+    /// The best forest of at most j + 1 roots; when `all`, the node itself is not one of them.
+    fn roots(&self, part: Part, mut j: usize, all: bool, out: &mut Parts) {
+        let choice = &self.choices[part.node as usize];
+        while !all && j > 0 && choice[j] & FEWER != 0 {
+            j -= 1;
+        }
+        if j == 0 || self.node(part).count == 1 {
+            out.push(part);
+            return;
+        }
+        let to_first = (choice[j] & !FEWER) as usize;
+        let (first, second) = self.halves(part);
+        self.roots(first, to_first - 1, false, out);
+        self.roots(second, j - to_first, false, out);
+    }
+    fn halves(&self, part: Part) -> (Part, Part) {
+        let child = self.node(part).child;
+        let count = self.tree.nodes[child as usize].count;
+        (Part { node: child, first: part.first }, Part { node: child + 1, first: part.first + count })
+    }
+}
+
+/// A binary node, and where its boxes begin in the tree's order.
+#[derive(Clone, Copy, Default)]
+struct Part {
+    node: u32,
+    first: u32,
+}
+
+/// Up to eight parts.
+#[derive(Default)]
+struct Parts {
+    parts: [Part; WIDTH],
+    len: usize,
+}
+
+impl Parts {
+    fn push(&mut self, part: Part) {
+        self.parts[self.len] = part;
+        self.len += 1;
+    }
+}
+
+impl std::ops::Deref for Parts {
+    type Target = [Part];
+    fn deref(&self) -> &[Part] {
+        &self.parts[..self.len]
+    }
+}
+
+struct Chooser<'a> {
+    nodes: &'a [BinaryNode],
+    max_leaf: u32,
+    fork: &'a dyn Fork,
+}
+
+impl Chooser<'_> {
+    /// Least cost of the node as a forest of at most 1..8 roots; writes its choice and those of its descendants.
+    fn costs(&self, node: usize, choice: &mut Choice, below: &mut [Choice]) -> [f32; WIDTH] {
+        let n = &self.nodes[node];
+        if n.count == 1 {
+            return [n.aabb.half_area() * (LEAF_COST + PRIMITIVE_COST); WIDTH];
+        }
+        let first = n.child as usize;
+        let (children, rest) = below.split_at_mut(2);
+        let (below_first, below_second) = rest.split_at_mut(2 * self.nodes[first].count as usize - 2);
+        let (choice_first, choice_second) = children.split_at_mut(1);
+        let (mut a, mut b) = ([0.0; WIDTH], [0.0; WIDTH]);
+        let mut left = || a = self.costs(first, &mut choice_first[0], below_first);
+        let mut right = || b = self.costs(first + 1, &mut choice_second[0], below_second);
+        if n.count > FORK_ABOVE {
+            self.fork.join(&mut left, &mut right);
+        } else {
+            left();
+            right();
+        }
+        choose(n, self.max_leaf, &a, &b, choice)
+    }
+}
+
+/// The programme's step: from the costs of both children to those of the node.
+fn choose(node: &BinaryNode, max_leaf: u32, a: &[f32; WIDTH], b: &[f32; WIDTH], choice: &mut Choice) -> [f32; WIDTH] {
+    let mut cost = [f32::INFINITY; WIDTH];
+    for j in 1..WIDTH {
+        for k in 0..j {
+            let both = a[k] + b[j - 1 - k];
+            if both < cost[j] {
+                cost[j] = both;
+                choice[j] = k as u8 + 1;
+            }
+        }
+    }
+    let area = node.aabb.half_area();
+    let inner = area * NODE_COST + cost[WIDTH - 1];
+    let leaf =
+        if node.count <= max_leaf { area * (LEAF_COST + PRIMITIVE_COST * node.count as f32) } else { f32::INFINITY };
+    choice[0] = u8::from(inner < leaf);
+    cost[0] = inner.min(leaf);
+    for j in 1..WIDTH {
+        if cost[j - 1] <= cost[j] {
+            cost[j] = cost[j - 1];
+            choice[j] |= FEWER;
+        }
+    }
+    cost
+}

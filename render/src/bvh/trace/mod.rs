@@ -1,0 +1,204 @@
+//! Tracing batches of rays through a forest: nearest hit, or whether there is any.
+
+mod scalar;
+mod setup;
+mod sphere;
+mod triangle;
+#[cfg(target_arch = "x86_64")]
+mod vector;
+#[cfg(target_arch = "x86_64")]
+mod wide;
+
+pub(super) use scalar::read_triangle;
+use setup::State;
+
+use super::forest::Forest;
+use crate::ray::{Hit, MISS, Ray};
+
+/// Which code traces. All give the same bits.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Kernel {
+    /// The fastest that this processor can run.
+    #[default]
+    Auto,
+    /// Plain Rust, one ray at a time.
+    Scalar,
+    /// AVX2 and FMA.
+    Avx2,
+    /// AVX-512 F, VL, DQ, BW, on vectors of 256 bits.
+    Avx512,
+}
+
+/// This processor cannot run the kernel that was asked for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
+#[error("this processor cannot run the {0:?} kernel: ask for Auto or Scalar")]
+pub struct UnsupportedKernel(pub Kernel);
+
+/// What tracing did.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Counters {
+    /// Rays traced.
+    pub rays: u64,
+    /// Nodes visited.
+    pub nodes: u64,
+    /// Leaves visited.
+    pub leaves: u64,
+}
+
+/// Traces rays on one thread; keeps its buffers from batch to batch.
+pub struct Tracer {
+    kernel: Kernel,
+    counters: Counters,
+    stack: scalar::Stack,
+    #[cfg(target_arch = "x86_64")]
+    lanes: wide::Lanes,
+}
+
+impl Tracer {
+    /// A tracer that runs the kernel.
+    ///
+    /// # Errors
+    /// When this processor cannot.
+    pub fn new(kernel: Kernel) -> Result<Tracer, UnsupportedKernel> {
+        let kernel = match kernel {
+            Kernel::Auto => [Kernel::Avx512, Kernel::Avx2].into_iter().find(|&k| runs(k)).unwrap_or(Kernel::Scalar),
+            k if runs(k) => k,
+            k => return Err(UnsupportedKernel(k)),
+        };
+        Ok(Tracer {
+            kernel,
+            counters: Counters::default(),
+            stack: Vec::new(),
+            #[cfg(target_arch = "x86_64")]
+            lanes: wide::Lanes::default(),
+        })
+    }
+
+    /// The kernel that runs; never [`Kernel::Auto`].
+    pub fn kernel(&self) -> Kernel {
+        self.kernel
+    }
+    /// Sums since the tracer was made.
+    pub fn counters(&self) -> Counters {
+        self.counters
+    }
+
+    /// Writes the nearest hit of each ray: the least (t, global id) with `tmin < t <= tmax`, or a miss.
+    ///
+    /// A ray with a member that is NaN, an infinite origin or direction, an origin beyond
+    /// [`super::MAX_COORDINATE`] or a direction whose largest component is not in 2^-30 ..= 2^30 hits nothing.
+    ///
+    /// # Panics
+    /// When there are not as many hits as rays, or the forest was changed and not finished.
+    pub fn closest(&mut self, forest: &Forest, rays: &[Ray], hits: &mut [Hit]) {
+        assert_eq!(rays.len(), hits.len(), "one hit for each ray");
+        self.run::<false>(forest, rays, &mut |i, state: &State| {
+            hits[i] = if state.prim == MISS {
+                Hit::miss(rays[i].tmax)
+            } else {
+                Hit { t: state.tmax, u: state.uv[0], v: state.uv[1], prim: state.prim, leaf: state.leaf }
+            };
+        });
+    }
+
+    /// Writes for each ray whether anything lies at `tmin < t <= tmax`. Which rays hit nothing: see [`Tracer::closest`].
+    ///
+    /// # Panics
+    /// As [`Tracer::closest`].
+    pub fn any(&mut self, forest: &Forest, rays: &[Ray], occluded: &mut [bool]) {
+        assert_eq!(rays.len(), occluded.len(), "one answer for each ray");
+        self.run::<true>(forest, rays, &mut |i, state: &State| occluded[i] = state.prim != MISS);
+    }
+
+    /// Traces and tells `done` each ray's number and final state.
+    fn run<const ANY: bool>(&mut self, forest: &Forest, rays: &[Ray], done: &mut impl FnMut(usize, &State)) {
+        assert!(forest.is_finished(), "a forest is traced after finish()");
+        let Tracer { kernel, counters, stack, .. } = self;
+        let mut of_spheres = Counters::default();
+        counters.rays += rays.len() as u64;
+        // triangles first, then the spheres that are nearer
+        let spheres = forest.sphere_root();
+        let mut finish = |i: usize, state: &mut State, stack: &mut scalar::Stack| {
+            if let Some(root) = spheres
+                && !(ANY && state.prim != MISS)
+            {
+                scalar::spheres(forest, root, &rays[i], state, ANY, stack, &mut of_spheres);
+            }
+            done(i, state);
+        };
+        match kernel {
+            #[cfg(target_arch = "x86_64")]
+            Kernel::Avx2 | Kernel::Avx512 => {
+                let mut finish = |i: usize, state: &mut State| finish(i, state, stack);
+                wide::trace::<ANY>(*kernel, &mut self.lanes, forest, rays, &[], &mut finish, counters);
+            }
+            _ => {
+                for (i, ray) in rays.iter().enumerate() {
+                    let mut state = State::new(ray, forest.largest());
+                    scalar::triangles(forest, &mut state, ANY, stack, counters);
+                    finish(i, &mut state, stack);
+                }
+            }
+        }
+        counters.nodes += of_spheres.nodes;
+        counters.leaves += of_spheres.leaves;
+    }
+}
+
+/// Whether this processor can run a kernel.
+fn runs(kernel: Kernel) -> bool {
+    match kernel {
+        Kernel::Auto | Kernel::Scalar => true,
+        #[cfg(target_arch = "x86_64")]
+        Kernel::Avx2 => {
+            is_x86_feature_detected!("avx2")
+                && is_x86_feature_detected!("fma")
+                && is_x86_feature_detected!("bmi1")
+                && is_x86_feature_detected!("bmi2")
+                && is_x86_feature_detected!("lzcnt")
+                && is_x86_feature_detected!("popcnt")
+        }
+        #[cfg(target_arch = "x86_64")]
+        Kernel::Avx512 => {
+            runs(Kernel::Avx2)
+                && is_x86_feature_detected!("avx512f")
+                && is_x86_feature_detected!("avx512vl")
+                && is_x86_feature_detected!("avx512dq")
+                && is_x86_feature_detected!("avx512bw")
+        }
+        #[cfg(not(target_arch = "x86_64"))]
+        Kernel::Avx2 | Kernel::Avx512 => false,
+    }
+}
+
+/// Takes a hit with `tmin < t <= tmax` if it is nearer than the best so far or, at the same distance, has the smaller id.
+#[inline(always)]
+fn accept(forest: &Forest, state: &mut State, t: f32, uv: [f32; 2], slot: u32, leaf: u32) {
+    if t < state.tmax || (t == state.tmax && (state.prim == MISS || forest.precedes(slot, state.prim))) {
+        (state.tmax, state.uv, state.prim, state.leaf) = (t, uv, slot, leaf);
+    }
+}
+
+/// The oracle of tests: every primitive, no tree. Bits of t, u, v and the global id, which is the place in the two lists.
+#[cfg(test)]
+pub(super) fn brute_force(
+    triangles: &[[[f32; 3]; 3]],
+    spheres: &[super::Sphere],
+    ray: &Ray,
+    largest: f32,
+) -> ([u32; 3], Option<crate::ray::PrimId>) {
+    let state = State::new(ray, largest);
+    let mut best = (Hit::miss(ray.tmax), None);
+    let of_triangles = triangles.iter().map(|t| triangle::intersect(&state, t).map(|i| (i.t, i.uv)));
+    let of_spheres = spheres
+        .iter()
+        .map(|s| sphere::intersect(ray, state.tmin, state.tmax, s.center, s.radius).map(|t| (t, [0.0; 2])));
+    for (id, hit) in of_triangles.chain(of_spheres).enumerate() {
+        if let Some((t, [u, v])) = hit
+            && (best.1.is_none() || t < best.0.t)
+        {
+            best = (Hit { t, u, v, ..best.0 }, Some(id as u64));
+        }
+    }
+    ([best.0.t.to_bits(), best.0.u.to_bits(), best.0.v.to_bits()], best.1)
+}

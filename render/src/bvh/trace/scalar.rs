@@ -1,0 +1,102 @@
+//! The plain kernel: one ray, one box, one primitive at a time. The vector kernels give its answers to the bit.
+//! Spheres are traced by it always: scenes have few.
+
+use super::super::forest::{Forest, read_sphere};
+use super::super::layout::*;
+use super::setup::State;
+use super::triangle::{Intersection, intersect};
+use super::{Counters, accept, sphere};
+use crate::ray::{MISS, Ray};
+
+/// Entry distance and reference of what is still to be visited.
+pub(super) type Stack = Vec<(f32, u32)>;
+
+/// Traces one ray through the forest's triangles; the first hit found ends it if `any`.
+pub(super) fn triangles(forest: &Forest, state: &mut State, any: bool, stack: &mut Stack, counters: &mut Counters) {
+    let arena = forest.arena();
+    traverse(arena, forest.root(), state, stack, counters, |state, leaf| {
+        let (at, n) = (offset(leaf), leaf_len(leaf));
+        for i in 0..n {
+            if let Some(Intersection { t, uv }) = intersect(state, &read_triangle(arena, at, n, i)) {
+                accept(forest, state, t, uv, read_u32(arena, at + (INDEX_ROW * n + i) * 4), leaf);
+            }
+        }
+        any && state.prim != MISS
+    });
+}
+
+/// Traces one ray through the forest's spheres; `state` has the best hit so far.
+pub(super) fn spheres(
+    forest: &Forest,
+    root: u32,
+    ray: &Ray,
+    state: &mut State,
+    any: bool,
+    stack: &mut Stack,
+    counters: &mut Counters,
+) {
+    let arena = forest.arena();
+    traverse(arena, root, state, stack, counters, |state, leaf| {
+        let (at, n) = (offset(leaf), leaf_len(leaf));
+        for i in 0..n {
+            let s = read_sphere(arena, at, n, i);
+            if let Some(t) = sphere::intersect(ray, state.tmin, state.tmax, s.center, s.radius) {
+                accept(forest, state, t, [0.0; 2], read_u32(arena, at + (INDEX_ROW * n + i) * 4), leaf);
+            }
+        }
+        any && state.prim != MISS
+    });
+}
+
+/// Visits the leaves whose boxes the ray enters, about nearest first, until `leaf` says that it is enough.
+fn traverse(
+    arena: &[u8],
+    root: u32,
+    state: &mut State,
+    stack: &mut Stack,
+    counters: &mut Counters,
+    mut leaf: impl FnMut(&mut State, u32) -> bool,
+) {
+    stack.clear();
+    stack.push((state.tmin, root));
+    while let Some((distance, reference)) = stack.pop() {
+        // behind the best hit; at the same distance there may be a smaller id
+        if distance > state.tmax {
+            continue;
+        }
+        if reference & LEAF != 0 {
+            counters.leaves += 1;
+            if leaf(state, reference) {
+                return;
+            }
+            continue;
+        }
+        counters.nodes += 1;
+        let first = stack.len();
+        for slot in 0..WIDTH {
+            let (aabb, child) = read_slot(arena, offset(reference), slot);
+            if let Some(entry) = enter(state, &aabb) {
+                stack.push((entry, child));
+            }
+        }
+        stack[first..].sort_by(|a, b| b.0.total_cmp(&a.0));
+    }
+}
+
+/// Where the ray enters a box, if it does before `tmax`. Conservative: see [`super::setup`].
+fn enter(state: &State, aabb: &Aabb) -> Option<f32> {
+    let (inverse, near, far) = (state.inverse.to_array(), state.near.to_array(), state.far.to_array());
+    let (mut first, mut last) = (state.tmin, state.tmax);
+    for axis in 0..3 {
+        let is_negative = state.near_row[axis] & 32 != 0;
+        let (entry, exit) = if is_negative { (aabb.hi[axis], aabb.lo[axis]) } else { (aabb.lo[axis], aabb.hi[axis]) };
+        first = first.max(entry.mul_add(inverse[axis], -near[axis]));
+        last = last.min(exit.mul_add(inverse[axis], -far[axis]));
+    }
+    (first <= last).then_some(first)
+}
+
+/// Vertices of the i-th triangle of a leaf of n.
+pub(in super::super) fn read_triangle(arena: &[u8], leaf: usize, n: usize, i: usize) -> [[f32; 3]; 3] {
+    std::array::from_fn(|v| std::array::from_fn(|c| read_f32(arena, leaf + ((v * 3 + c) * n + i) * 4)))
+}
