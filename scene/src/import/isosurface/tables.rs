@@ -296,7 +296,8 @@ fn tube(p: &[u8], q: &[u8], triangles: &mut Vec<[u8; 3]>, centers: &mut Vec<u16>
         let count = (to + l.len() - from) % l.len() + 1;
         (0..count).map(|k| l[(from + k) % l.len()]).collect()
     };
-    let mut best: Option<((bool, u32), [Vec<u8>; 2])> = None;
+    let mut best = None;
+    let mut least = (true, u32::MAX);
     for (i, j) in pairs(p.len(), q.len()) {
         for (k, l) in pairs(p.len(), q.len()) {
             let (Some(a), Some(b)) = (inner(p[i], q[j]), inner(p[k], q[l])) else { continue };
@@ -306,12 +307,13 @@ fn tube(p: &[u8], q: &[u8], triangles: &mut Vec<[u8; 3]>, centers: &mut Vec<u16>
             let discs = [[part(p, i, k), part(q, l, j)].concat(), [part(p, k, i), part(q, j, l)].concat()];
             let plain = polygon(&discs[0]);
             let cost = (plain.is_none(), a + b + plain.map_or(0, |c| c.0));
-            if best.as_ref().is_none_or(|old| cost < old.0) {
-                best = Some((cost, discs));
+            if cost < least {
+                least = cost;
+                best = Some(discs);
             }
         }
     }
-    let Some((_, [one, two])) = best else { return false };
+    let Some([one, two]) = best else { return false };
     disc(&one, triangles, centers);
     fan(&two, triangles, centers);
     true
