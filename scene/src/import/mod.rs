@@ -1,10 +1,12 @@
 //! Reading scenes: a file or folder of any supported format to a [`Description`], and its records.
 
+pub mod isosurface;
 mod mitsuba;
 mod placement;
 mod shapes;
 mod stream;
 pub(crate) mod vector;
+pub mod volume;
 
 use std::path::Path;
 

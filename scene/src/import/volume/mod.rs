@@ -1,0 +1,120 @@
+//! Volumes: what a file says of them, and their slices one at a time.
+//!
+//! World space is LPS in millimetres, DICOM's: x to the patient's left, y to the back, z to the head. NIfTI's RAS and NRRD's
+//! named spaces are converted.
+
+mod layout;
+mod nrrd;
+mod slices;
+
+use std::fs::File;
+use std::io::Read;
+use std::path::Path;
+
+use crate::ImportError;
+use crate::description::Affine;
+use layout::Layout;
+pub use layout::SampleType;
+pub use slices::Slices;
+
+/// Most samples in one slice: two slices of f64 are in memory while a surface is made.
+pub const MAX_SLICE_SAMPLES: u64 = 1 << 26;
+
+/// What a volume is.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Volume {
+    /// Samples along x (fastest in the file), y and z (slices); each at least 1.
+    pub dims: [usize; 3],
+    /// From sample numbers (the centre of the first sample is the origin) to LPS millimetres. It may shear (gantry tilt) and
+    /// mirror.
+    pub to_world: Affine,
+    /// Value = stored * slope + intercept; of the first slice where slices differ (DICOM).
+    pub slope: f64,
+    /// See `slope`.
+    pub intercept: f64,
+    /// How samples are stored.
+    pub sample: SampleType,
+    /// Files of the folder that are no part of the volume (not DICOM).
+    pub skipped_files: usize,
+}
+
+impl Volume {
+    /// The world's box around all samples: least and greatest corner.
+    pub fn world_box(&self) -> [[f64; 3]; 2] {
+        let mut bounds = [[f64::INFINITY; 3], [f64::NEG_INFINITY; 3]];
+        for corner in 0..8 {
+            let p = self.to_world.point([0, 1, 2].map(|k| ((corner >> k & 1) * (self.dims[k] - 1)) as f64));
+            for k in 0..3 {
+                bounds[0][k] = bounds[0][k].min(p[k]);
+                bounds[1][k] = bounds[1][k].max(p[k]);
+            }
+        }
+        bounds
+    }
+}
+
+/// A volume whose headers are read and checked, to be passed over any number of times.
+#[derive(Clone, Debug)]
+pub struct VolumeFile {
+    volume: Volume,
+    layout: Layout,
+    header_bytes: u64,
+}
+
+impl VolumeFile {
+    /// What it is.
+    pub fn volume(&self) -> &Volume {
+        &self.volume
+    }
+    /// Bytes that were read to open it.
+    pub fn header_bytes(&self) -> u64 {
+        self.header_bytes
+    }
+    /// Starts a pass over the slices, z = 0 first.
+    pub fn slices(&self) -> Slices<'_> {
+        Slices::new(&self.layout)
+    }
+}
+
+/// Opens a volume; the format is told from the content: an NRRD or NHDR file.
+pub fn open(path: &Path) -> Result<VolumeFile, ImportError> {
+    let io = |source| ImportError::Io { path: path.to_owned(), source };
+    let mut magic = [0; 4];
+    let mut file = File::open(path).map_err(io)?;
+    let mut have = 0;
+    while have < magic.len() {
+        match file.read(&mut magic[have..]).map_err(io)? {
+            0 => break,
+            n => have += n,
+        }
+    }
+    if &magic == b"NRRD" {
+        return nrrd::open(path);
+    }
+    Err(malformed(path, 0, "not an NRRD or NHDR file"))
+}
+
+/// An error of the content.
+fn malformed(path: &Path, line: u32, message: impl Into<String>) -> ImportError {
+    ImportError::Malformed { place: crate::description::Place { file: path.to_owned(), line }, message: message.into() }
+}
+
+/// A map from sample numbers to the world by its linear part (row, column) and its translation; refused unless finite and
+/// of full rank.
+fn affine(
+    path: &Path,
+    linear: impl Fn(usize, usize) -> f64,
+    translation: impl Fn(usize) -> f64,
+) -> Result<Affine, ImportError> {
+    let map =
+        Affine(std::array::from_fn(|r| std::array::from_fn(|c| if c < 3 { linear(r, c) } else { translation(r) })));
+    let determinant = map.determinant();
+    if !map.0.as_flattened().iter().all(|v| v.is_finite()) || !determinant.is_finite() || determinant == 0.0 {
+        return Err(malformed(
+            path,
+            0,
+            "the placement of the samples is flat or not finite: directions must span space",
+        ));
+    }
+    Ok(map)
+}
