@@ -4,7 +4,7 @@ use std::str::FromStr;
 
 use super::shapes;
 use super::vector::{cross, look_at, normalize, sub};
-use crate::description::{Affine, Camera, Geometry, Place, Shape};
+use crate::description::{Affine, Camera, Place, Shape};
 
 /// What the caller decides about an import.
 #[derive(Clone, Debug, Default)]
@@ -134,11 +134,11 @@ impl FromStr for Light {
         const FORM: &str = "a light is origin,target,width,height,radiance: nine numbers (grey) or eleven (red, green, blue), as \
                             2,3,2,0,0,0,1,1,10";
         let v = numbers(text, FORM)?;
-        let (&[a, b, c, d, e, f, w, h, ..], rgb) = (match v.len() {
-            9 => (v.first_chunk::<8>().unwrap_or(&[0.0; 8]), [v[8]; 3]),
-            11 => (v.first_chunk::<8>().unwrap_or(&[0.0; 8]), [v[8], v[9], v[10]]),
-            n => return Err(OptionError(format!("{n} numbers in \"{text}\"; {FORM}"))),
-        });
+        let (a, b, c, d, e, f, w, h, rgb) = match v[..] {
+            [a, b, c, d, e, f, w, h, grey] => (a, b, c, d, e, f, w, h, [grey; 3]),
+            [a, b, c, d, e, f, w, h, red, green, blue] => (a, b, c, d, e, f, w, h, [red, green, blue]),
+            _ => return Err(OptionError(format!("{} numbers in \"{text}\"; {FORM}", v.len()))),
+        };
         if !(w > 0.0 && h > 0.0) {
             return Err(OptionError(format!("the light's width and height {w}, {h} should be above 0")));
         }

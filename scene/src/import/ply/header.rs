@@ -115,10 +115,9 @@ impl Header {
     pub fn read(source: &mut Source) -> Result<Header, ImportError> {
         let mut format = None;
         let mut elements: Vec<Element> = vec![];
-        if source.peek(3)? != b"ply" {
-            return source.fail_line("this is no PLY file: it does not begin with \"ply\"");
+        if source.peek(3)? != b"ply" || source.line_bytes()?.is_none_or(|line| line.trim_ascii_end() != b"ply") {
+            return source.fail_line("this is no PLY file: its first line is not \"ply\"");
         }
-        source.line_bytes()?;
         loop {
             if source.offset() > MAX_BYTES {
                 return source.fail_line(format!("the header is longer than {MAX_BYTES} bytes"));
