@@ -3,6 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use super::framing::{self, Up};
+use super::isosurface::IsoSurfaceSource;
 use super::mesh::extension;
 use super::{DEFAULT_ALBEDO, ImportOptions, refuse};
 use crate::ImportError;
@@ -60,7 +61,11 @@ pub(super) fn volume(path: &Path, options: &ImportOptions) -> Result<(Descriptio
             "a volume has no surface of its own: pass --iso VALUE (for CT in HU; 300 is bone, -300 is skin)",
         );
     };
+    let source = IsoSurfaceSource::new(path, iso)?;
     let mut out = description(options);
+    // the box of the samples is known without a pass over them
+    out.bounds = Some(source.world_box());
+    out.bytes_read = source.file().header_bytes();
     out.shapes.push(shape(path, Geometry::IsoSurface { path: path.into(), iso }));
     Ok((out, Up::Z))
 }

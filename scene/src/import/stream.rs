@@ -1,8 +1,10 @@
 //! The records of a description, shape after shape.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
+use std::sync::OnceLock;
 use std::sync::atomic::{AtomicU64, Ordering};
 
+use super::isosurface::IsoSurfaceSource;
 use super::mesh::{MeshOptions, MeshStream};
 use super::obj::ObjReader;
 use super::placement::Placement;
@@ -36,12 +38,28 @@ pub struct DescriptionSource<'a> {
     description: &'a Description,
     options: StreamOptions,
     spilled: AtomicU64,
+    /// By shape: volumes that have been opened.
+    volumes: Vec<Option<OnceLock<IsoSurfaceSource>>>,
 }
 
 impl<'a> DescriptionSource<'a> {
     /// The records of `description`, in the order of its shapes.
     pub fn new(description: &'a Description, options: StreamOptions) -> Self {
-        DescriptionSource { description, options, spilled: AtomicU64::new(0) }
+        let is_volume = |s: &Shape| matches!(s.geometry, Geometry::IsoSurface { .. });
+        let volumes = description.shapes.iter().map(|s| is_volume(s).then(OnceLock::new)).collect();
+        DescriptionSource { description, options, spilled: AtomicU64::new(0), volumes }
+    }
+
+    /// The surface of a volume; its headers are read once for all passes.
+    fn surface(&self, number: usize, path: &Path, iso: f64, shape: &Shape) -> Result<&IsoSurfaceSource, ImportError> {
+        let Some(slot) = &self.volumes[number] else { unreachable!("made for each surface of a volume") };
+        if slot.get().is_none() {
+            let source = IsoSurfaceSource::new(path, iso)?.placed(&shape.to_world, number as u32);
+            // two passes that begin at once read the headers twice; the first to finish is kept
+            let _ = slot.set(source);
+        }
+        let Some(source) = slot.get() else { unreachable!("set above") };
+        Ok(source)
     }
 
     /// Bytes of vertex arrays that went to temporary files, over all passes so far.
@@ -70,9 +88,9 @@ impl<'a> DescriptionSource<'a> {
                     }
                 }
             }
-            Geometry::IsoSurface { path, .. } => {
-                let message = "volumes cannot be read yet".into();
-                return Err(ImportError::Limit { path: path.clone(), message });
+            Geometry::IsoSurface { path, iso } => {
+                let records = self.surface(number as usize, path, *iso, shape)?.open()?;
+                if shape.flip_normals { Box::new(Flipped(records)) } else { records }
             }
         })
     }
@@ -164,5 +182,24 @@ impl RecordStream for InlineStream<'_> {
     }
     fn bytes_read(&self) -> u64 {
         0
+    }
+}
+
+/// Triangles turned round.
+struct Flipped<'a>(Box<dyn RecordStream + 'a>);
+
+impl RecordStream for Flipped<'_> {
+    fn next(&mut self, out: &mut Vec<Record>, max: usize) -> Result<usize, ImportError> {
+        let before = out.len();
+        let n = self.0.next(out, max)?;
+        for record in &mut out[before..] {
+            if let Record::Triangle(t) = record {
+                t.p.swap(1, 2);
+            }
+        }
+        Ok(n)
+    }
+    fn bytes_read(&self) -> u64 {
+        self.0.bytes_read()
     }
 }
