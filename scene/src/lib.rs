@@ -5,8 +5,10 @@ pub mod grid;
 pub mod import;
 pub mod manifest;
 pub mod objects;
+pub mod overlap;
 pub mod prepare;
 pub mod record;
+pub mod split;
 
 use std::path::PathBuf;
 

@@ -4,14 +4,17 @@
 //! the splits that hold its primitives (its *owners*) and the tight box of what is inside it. A ray that may still
 //! hit something outside the resident splits finds out here where to go ([`Grid::next_foreign`]).
 
+pub mod count;
 pub mod lattice;
 mod splitset;
 #[cfg(test)]
 mod tests;
+pub mod touch;
 pub mod walk;
 
 use serde::{Deserialize, Serialize};
 
+pub use count::{Candidate, StoppedBy};
 pub use lattice::{Lattice, MAX_SUBDIV};
 pub use splitset::SplitSet;
 pub use walk::{Foreign, Progress};

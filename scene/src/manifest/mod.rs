@@ -9,6 +9,7 @@ use rayherd_render::ray::PrimId;
 use serde::{Deserialize, Serialize};
 
 use crate::description::{Camera, Description, Substitution};
+pub use crate::grid::{Candidate, StoppedBy};
 use crate::grid::{Grid, GridData};
 use crate::objects::{ObjectError, ObjectHash, ObjectKind, ObjectRef, ObjectStore};
 use crate::prepare::PrepareSettings;
@@ -74,22 +75,12 @@ pub struct SplitEntry {
     pub copied: bool,
 }
 
-/// What stopped the search for a subdivision.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum StoppedBy {
-    /// Condition 2 is met: the share of primitives in contested cells is at or below the threshold.
-    Threshold,
-    /// Condition 3: occupied cells are several times the splits.
-    Several,
-    /// The largest subdivision allowed was reached.
-    Limit,
-}
-
 /// How the grid was chosen, and what overlap reduction did.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct GridChoice {
+    /// The chosen subdivision.
+    pub subdiv: u32,
     /// Subdivisions that were counted, ascending.
     pub candidates: Vec<Candidate>,
     /// Why the chosen one was taken.
@@ -104,29 +95,6 @@ pub struct GridChoice {
     pub copies: u64,
     /// Geometry and attribute bytes of copied splits.
     pub rewritten_bytes: u64,
-}
-
-/// What was counted for one subdivision.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct Candidate {
-    /// Cells along an axis.
-    pub subdiv: u32,
-    /// Occupied cells.
-    pub occupied: u64,
-    /// Most primitives in a cell.
-    pub fullest: u64,
-    /// (primitive, cell) pairs.
-    pub pairs: u64,
-    /// Of those, in cells that several splits claim.
-    pub contested_pairs: u64,
-}
-
-impl Candidate {
-    /// Share of primitives in contested cells, a primitive counted in every cell that it overlaps.
-    pub fn contested_share(&self) -> f64 {
-        if self.pairs == 0 { 0.0 } else { self.contested_pairs as f64 / self.pairs as f64 }
-    }
 }
 
 /// What the source says about camera, film and paths. The camera is in source coordinates: subtract

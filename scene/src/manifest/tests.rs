@@ -37,6 +37,7 @@ pub(crate) fn sample() -> Manifest {
         splits: vec![split(0, false), split(1, false), split(2, true)],
         grid: GridData { subdiv: 2, lo: [-1.0; 3], hi: [1.0; 3], cells: vec![cell(0, -0.7, 2), cell(1, 0.3, 1)] },
         choice: GridChoice {
+            subdiv: 2,
             candidates: vec![Candidate { subdiv: 2, occupied: 2, fullest: 4, pairs: 8, contested_pairs: 4 }],
             stopped_by: StoppedBy::Several,
             capacity: 4,

@@ -1,7 +1,393 @@
 //! From a description and its records to a prepared scene: the passes.
+//!
+//! 1. *Bounds*: the source is read for its f64 bounds, unless importing has found them. Their centre becomes the origin.
+//! 2. *Reading*: the source is read once more (at most twice in all). Records are recentred, rounded to f32, checked, and put in a
+//!    spool: in memory while they are few, else in a temporary file.
+//! 3. *Counting*: now the number of splits is known. All candidate grids are counted in one pass over the spool.
+//! 4. *Building*: per split, what lies in which cell of the chosen grid; its tree and attributes are built and stored; primitives of
+//!    contested cells are dealt to groups.
+//! 5. *Reducing*: groups are joined to new splits, which are built and stored.
+//!
+//! Memory: one batch of the source, the spool's share, the grid tables, and as many splits as there are threads. Every step that runs
+//! in parallel is a pure function of one split or one candidate, and results are joined in their order: the bytes do not
+//! depend on threads.
 
+mod build;
+mod counting;
 mod fingerprint;
+mod incidence;
+mod ingest;
+mod progress;
+mod records;
+mod reduce;
+mod report;
 mod settings;
+mod spool;
+#[cfg(test)]
+mod tests;
+
+use std::io;
+use std::ops::Range;
+use std::path::PathBuf;
+use std::time::Duration;
+
+use rayherd_render::bvh::BuildError;
+use rayherd_render::world::{ShapeInfo, World};
+use rayon::prelude::*;
+
+use crate::ImportError;
+use crate::description::Description;
+use crate::grid::count::{Counter, Primitives, candidates, choose};
+use crate::grid::{CellData, GridData, Lattice};
+use crate::manifest::{Counts, Defaults, FORMAT, GridChoice, Manifest, ManifestError, SplitEntry};
+use crate::objects::{ObjectError, ObjectHash, ObjectKind, ObjectRef, ObjectStore};
+use crate::overlap;
+use crate::record::RecordSource;
+use crate::split::{Capacity, cut};
+
+use build::build_split;
+use counting::CountingStore;
+use incidence::{CellBox, ChosenCells, Incidence, incidence};
+use ingest::Ingested;
+use spool::Spool;
 
 pub use fingerprint::fingerprint;
+pub use progress::{NoProgress, PrepareProgress, Stage};
+pub use report::{ByteKind, ByteOp, ByteRow, PrepareReport};
 pub use settings::{Cut, PrepareSettings, SpoolSettings};
+
+/// A prepared scene.
+#[derive(Clone, Debug)]
+pub struct Prepared {
+    /// What it is.
+    pub manifest: Manifest,
+    /// Name of the manifest in the store.
+    pub reference: ObjectRef,
+    /// It was there already: nothing was read or written but the manifest.
+    pub reused: bool,
+    /// What it took.
+    pub report: PrepareReport,
+}
+
+/// Why a scene cannot be prepared.
+#[derive(Debug, thiserror::Error)]
+pub enum PrepareError {
+    /// The source cannot be read.
+    #[error(transparent)]
+    Import(#[from] ImportError),
+    /// The store cannot be used.
+    #[error(transparent)]
+    Store(#[from] ObjectError),
+    /// A setting is out of range.
+    #[error("{0}")]
+    Settings(String),
+    /// Nothing can be hit.
+    #[error(
+        "the scene has no primitive that can be hit: of {records} records, {degenerate} have no area, {non_finite} hold \
+         NaN or infinity and {out_of_range} lie beyond 2^39 units; check that the file is the right one and not cut off, and \
+         that its scale is sane"
+    )]
+    Empty {
+        /// Records in the source.
+        records: u64,
+        /// Of zero area.
+        degenerate: u64,
+        /// With NaN or infinity.
+        non_finite: u64,
+        /// Too far away.
+        out_of_range: u64,
+    },
+    /// A record names a shape or material that the description lacks: a mistake of the importer.
+    #[error("{0}")]
+    Inconsistent(String),
+    /// A split's tree cannot be built.
+    #[error("split {split}: {source}; use a smaller block size or more splits")]
+    Build {
+        /// Which.
+        split: u32,
+        /// Why.
+        source: BuildError,
+    },
+    /// More splits than a manifest holds.
+    #[error("{0} splits are too many (4194303 at most); use a larger block size")]
+    TooManySplits(u64),
+    /// The temporary file cannot be written or read.
+    #[error("cannot use a temporary file in {}: {source}; free some space or name another folder", folder.display())]
+    Spool {
+        /// Its folder.
+        folder: PathBuf,
+        /// Why.
+        source: io::Error,
+    },
+}
+
+/// Prepares a scene, or finds that it is prepared already.
+///
+/// `source` yields the records of `description`. The bytes of every object are a function of source and settings alone, not of threads
+/// (rayon's current pool is used), `spool` or `store`.
+///
+/// # Errors
+/// See [`PrepareError`]. What was stored until then stays, without a name.
+pub fn prepare(
+    description: &Description,
+    source: &dyn RecordSource,
+    settings: &PrepareSettings,
+    spool: &SpoolSettings,
+    store: &dyn ObjectStore,
+    progress: &dyn PrepareProgress,
+) -> Result<Prepared, PrepareError> {
+    settings.check().map_err(PrepareError::Settings)?;
+    let print = fingerprint(description)?;
+    match Manifest::find(store, &print, settings) {
+        Ok(Some((reference, manifest))) => {
+            let report = PrepareReport::reused(reference.bytes);
+            return Ok(Prepared { manifest, reference, reused: true, report });
+        }
+        Ok(None) => {}
+        Err(ManifestError::Store(error)) => return Err(error.into()),
+        // find() takes a manifest that it cannot read for none
+        Err(other) => return Err(PrepareError::Inconsistent(other.to_string())),
+    }
+    let store = CountingStore::new(store);
+
+    // 1, 2
+    let (offset, mut ingested) = read(description, source, spool, progress)?;
+    let world = world(description, &mut ingested)?;
+    let world_bytes = serde_json::to_vec(&world).map_err(|e| PrepareError::Inconsistent(e.to_string()))?;
+    let content = content_hash(&offset, &ingested.hash, &world_bytes);
+    let Ingested { spool, counts, lo, hi, .. } = ingested;
+    let spool_error = |source| PrepareError::Spool { folder: spool.folder().clone(), source };
+
+    // 3
+    let primitives = counts.triangles + counts.spheres;
+    let ranges = cut(settings.cut, primitives);
+    if ranges.len() >= 1 << 22 {
+        return Err(PrepareError::TooManySplits(ranges.len() as u64));
+    }
+    let capacity = Capacity::new(settings.cut, primitives);
+    let (cells, mut choice) =
+        choose_grid(&spool, &ranges, (lo, hi), capacity, settings, progress).map_err(spool_error)?;
+
+    // 4
+    let groups = settings
+        .overlap_reduction
+        .then(|| overlap::group(&cells.lattice, &cells.indices, &cells.primitives, &cells.contested, capacity.copied));
+    let mut building = Building {
+        store: &store,
+        cells: &cells,
+        groups: groups.as_ref(),
+        spool,
+        splits: Vec::new(),
+        boxes: vec![CellBox::EMPTY; cells.len()],
+        owners: vec![Vec::new(); cells.len()],
+        parts: vec![Vec::new(); groups.as_ref().map_or(0, |g| g.count as usize)],
+        contested: 0,
+        tree: Duration::ZERO,
+    };
+    building.source_splits(&ranges, progress)?;
+    choice.contested_primitives = building.contested;
+    choice.contested_cells = cells.contested.iter().filter(|&&c| c).count() as u64;
+
+    // 5
+    building.reduce(capacity.copied, progress)?;
+    let Building { splits, boxes, owners, spool, tree, .. } = building;
+    let of_copies = || splits.iter().filter(|s| s.copied);
+    choice.copies = of_copies().map(|s| s.triangles + s.spheres).sum();
+    choice.rewritten_bytes = of_copies().map(|s| s.geometry.bytes + s.attributes.bytes).sum();
+
+    let world = store.put(ObjectKind::Manifest, &world_bytes)?;
+    let grid = grid_data(&cells, &boxes, owners, lo, hi);
+    let defaults = Defaults::of(description);
+    let settings = settings.clone();
+    let manifest = Manifest {
+        format: FORMAT,
+        settings,
+        source: print,
+        content,
+        offset,
+        lo,
+        hi,
+        world,
+        splits,
+        grid,
+        choice,
+        defaults,
+        counts,
+    };
+    let reference = manifest.store(&store)?;
+    let report = PrepareReport::new(&manifest, &store, spool.traffic(), tree);
+    Ok(Prepared { manifest, reference, reused: false, report })
+}
+
+/// Reads the source: at most twice, the importer's own reading for bounds included.
+fn read(
+    description: &Description,
+    source: &dyn RecordSource,
+    spool: &SpoolSettings,
+    progress: &dyn PrepareProgress,
+) -> Result<([f64; 3], Ingested), PrepareError> {
+    let known = description.bounds.filter(ingest::usable_bounds);
+    let (lo, hi, bytes) = match known {
+        Some([lo, hi]) => (lo, hi, description.bytes_read),
+        None => match ingest::bounds(source, progress)? {
+            Some(found) => (found.lo, found.hi, found.bytes + description.bytes_read),
+            // nothing usable: the pass below counts why
+            None => ([0.0; 3], [0.0; 3], description.bytes_read),
+        },
+    };
+    let offset = std::array::from_fn(|a| 0.5 * (lo[a] + hi[a]));
+    let mut ingested = ingest::ingest(description, source, offset, spool, progress)?;
+    let Counts { records, triangles, spheres, degenerate, non_finite, out_of_range, .. } = ingested.counts;
+    if triangles + spheres == 0 {
+        return Err(PrepareError::Empty { records, degenerate, non_finite, out_of_range });
+    }
+    ingested.counts.source_reads = 2;
+    ingested.counts.source_bytes += bytes;
+    Ok((offset, ingested))
+}
+
+fn world(description: &Description, ingested: &mut Ingested) -> Result<World, PrepareError> {
+    let materials = description.materials.len();
+    if let Some(shape) = description.shapes.iter().find(|s| s.material as usize >= materials) {
+        let message = format!("shape {:?} has material {} of {materials}", shape.name, shape.material);
+        return Err(PrepareError::Inconsistent(message));
+    }
+    let shapes = description.shapes.iter().map(|s| ShapeInfo {
+        name: s.name.clone(),
+        material: s.material,
+        emission: s.emission,
+    });
+    Ok(World {
+        materials: description.materials.clone(),
+        shapes: shapes.collect(),
+        emissive: std::mem::take(&mut ingested.emissive),
+        environment: description.environment,
+        lo: ingested.lo,
+        hi: ingested.hi,
+    })
+}
+
+fn content_hash(offset: &[f64; 3], records: &blake3::Hash, world: &[u8]) -> ObjectHash {
+    let mut hasher = blake3::Hasher::new();
+    hasher.update(b"rayherd content\0").update(&FORMAT.to_le_bytes());
+    for x in offset {
+        hasher.update(&x.to_le_bytes());
+    }
+    hasher.update(records.as_bytes()).update(world);
+    ObjectHash(*hasher.finalize().as_bytes())
+}
+
+/// Counts all candidates in one pass over the spool and picks one.
+fn choose_grid(
+    spool: &Spool,
+    ranges: &[Range<u64>],
+    (lo, hi): ([f32; 3], [f32; 3]),
+    capacity: Capacity,
+    settings: &PrepareSettings,
+    progress: &dyn PrepareProgress,
+) -> io::Result<(ChosenCells, GridChoice)> {
+    let splits = ranges.len() as u32;
+    progress.begin(Stage::Counting, Some(ranges.len() as u64));
+    let mut counters = Vec::new();
+    for subdiv in candidates(splits, settings) {
+        counters.push(Counter::new(Lattice::new(subdiv, lo, hi).map_err(io::Error::other)?));
+    }
+    for (split, range) in (0..).zip(ranges) {
+        let records = spool.range(range)?;
+        let spheres: Vec<_> = records.spheres.iter().map(|s| (s.center, s.radius)).collect();
+        let primitives = Primitives { triangles: &records.triangles, spheres: &spheres };
+        counters.par_iter_mut().for_each(|counter| counter.add(split, primitives));
+        progress.advance(1);
+    }
+    let counted: Vec<_> = counters.iter().map(Counter::summary).collect();
+    let (chosen, stopped_by) = choose(&counted, splits, capacity.source, settings);
+    let cells = ChosenCells::new(&counters[chosen]);
+    let choice = GridChoice {
+        subdiv: counted[chosen].subdiv,
+        candidates: counted,
+        stopped_by,
+        capacity: capacity.source,
+        contested_cells: 0,
+        contested_primitives: 0,
+        copies: 0,
+        rewritten_bytes: 0,
+    };
+    Ok((cells, choice))
+}
+
+fn grid_data(cells: &ChosenCells, boxes: &[CellBox], owners: Vec<Vec<u32>>, lo: [f32; 3], hi: [f32; 3]) -> GridData {
+    let mut out = GridData { subdiv: cells.lattice.subdiv(), lo, hi, cells: Vec::new() };
+    for (n, owners) in owners.into_iter().enumerate() {
+        // a conservative test may have named a cell that nothing reaches
+        if !boxes[n].is_empty() {
+            let CellBox { lo, hi } = boxes[n];
+            let primitives = u64::from(cells.primitives[n]);
+            out.cells.push(CellData { index: cells.indices[n], lo, hi, primitives, owners });
+        }
+    }
+    out
+}
+
+/// Splits on their way into the store.
+struct Building<'a> {
+    store: &'a CountingStore<'a>,
+    cells: &'a ChosenCells,
+    groups: Option<&'a overlap::Groups>,
+    spool: Spool,
+    splits: Vec<SplitEntry>,
+    /// What is in a cell, by its number.
+    boxes: Vec<CellBox>,
+    /// Who owns a cell, by its number.
+    owners: Vec<Vec<u32>>,
+    /// Chunks of the spool that hold a group's primitives, by ascending split.
+    parts: Vec<Vec<usize>>,
+    contested: u64,
+    tree: Duration,
+}
+
+impl Building<'_> {
+    fn spool_error(&self, source: io::Error) -> PrepareError {
+        PrepareError::Spool { folder: self.spool.folder().clone(), source }
+    }
+
+    fn source_splits(&mut self, ranges: &[Range<u64>], progress: &dyn PrepareProgress) -> Result<(), PrepareError> {
+        progress.begin(Stage::Building, Some(ranges.len() as u64));
+        let of_cell = self.groups.map_or(&[][..], |g| &g.of_cell);
+        // no more at a time than there are threads: each holds a split and its tree
+        for wave in ranges.chunks(rayon::current_num_threads()) {
+            let first = self.splits.len() as u32;
+            let work = |(split, range): (u32, &Range<u64>)| -> Result<_, PrepareError> {
+                let records = self.spool.range(range).map_err(|e| self.spool_error(e))?;
+                let found = incidence(self.cells, of_cell, &records);
+                let dealt = records.deal(&found.triangles, &found.spheres);
+                Ok((build_split(split, &records, false, self.store)?, found, dealt))
+            };
+            let numbered: Vec<(u32, &Range<u64>)> = (first..).zip(wave).collect();
+            // in order, so that the first error is always the same one
+            let done: Vec<_> = numbered.into_par_iter().map(work).collect();
+            for result in done {
+                let (built, found, dealt) = result?;
+                let split = self.splits.len() as u32;
+                self.splits.push(built.entry);
+                self.tree += built.tree;
+                self.note(split, &found);
+                for (group, records) in dealt {
+                    let chunk = self.spool.push(records).map_err(|e| self.spool_error(e))?;
+                    self.parts[group as usize].push(chunk);
+                }
+            }
+            progress.advance(wave.len() as u64);
+        }
+        Ok(())
+    }
+
+    /// Adds what a source split has in the cells.
+    fn note(&mut self, split: u32, found: &Incidence) {
+        self.contested += found.contested;
+        for (number, part) in &found.cells {
+            let n = *number as usize;
+            self.boxes[n].add(part);
+            self.owners[n].push(split);
+        }
+    }
+}

@@ -1,0 +1,93 @@
+//! A split's objects: built, encoded, stored.
+
+use std::time::{Duration, Instant};
+
+use rayherd_render::attributes::AttributeBlock;
+use rayherd_render::bvh::{Fork, build_block};
+
+use super::PrepareError;
+use super::counting::CountingStore;
+use super::incidence::{CellBox, box_of};
+use super::records::{NORMALS, Records, UVS};
+use crate::grid::lattice::{round_down, round_up};
+use crate::manifest::SplitEntry;
+use crate::objects::{ObjectKind, ObjectStore};
+
+/// Lends rayon's threads to the tree builder.
+struct Rayon;
+
+impl Fork for Rayon {
+    fn join(&self, a: &mut (dyn FnMut() + Send), b: &mut (dyn FnMut() + Send)) {
+        rayon::join(a, b);
+    }
+}
+
+/// A stored split and what its tree took.
+#[derive(Debug)]
+pub(crate) struct Built {
+    pub entry: SplitEntry,
+    pub tree: Duration,
+}
+
+/// Builds and stores a split of at least one primitive. `number` is for messages.
+pub(crate) fn build_split(
+    number: u32,
+    records: &Records,
+    copied: bool,
+    store: &CountingStore,
+) -> Result<Built, PrepareError> {
+    let spheres: Vec<_> = records.spheres.iter().map(|s| s.sphere()).collect();
+    let started = Instant::now();
+    let block = build_block(&records.triangles, &records.triangle_ids, &spheres, &records.sphere_ids, &Rayon)
+        .map_err(|source| PrepareError::Build { split: number, source })?;
+    let tree = started.elapsed();
+    let geometry = store.put(ObjectKind::Geometry, &block)?;
+    drop(block);
+    let attributes = store.put(ObjectKind::Attributes, &attributes(records).encode())?;
+
+    let mut bounds = CellBox::EMPTY;
+    records.triangles.iter().for_each(|p| bounds.add(&box_of(p)));
+    for s in &records.spheres {
+        let end = |sign: f64| s.center.map(|c| f64::from(c) + sign * f64::from(s.radius));
+        bounds.add(&CellBox { lo: end(-1.0).map(round_down), hi: end(1.0).map(round_up) });
+    }
+    let (first_id, last_id) = records.id_range().unwrap_or_default();
+    let entry = SplitEntry {
+        geometry,
+        attributes,
+        triangles: records.triangles.len() as u64,
+        spheres: records.spheres.len() as u64,
+        lo: bounds.lo,
+        hi: bounds.hi,
+        first_id,
+        last_id,
+        copied,
+    };
+    Ok(Built { entry, tree })
+}
+
+/// Attributes by local index: triangles by ascending id, then spheres.
+fn attributes(records: &Records) -> AttributeBlock {
+    let shapes: Vec<u32> =
+        records.extras.iter().map(|e| e.shape).chain(records.spheres.iter().map(|s| s.shape)).collect();
+    let mut block = AttributeBlock { shapes, normals: Vec::new(), uvs: Vec::new() };
+    if !records.normals.is_empty() {
+        block.normals = spread(records, &records.normals, NORMALS);
+    }
+    if !records.uvs.is_empty() {
+        block.uvs = spread(records, &records.uvs, UVS);
+    }
+    block
+}
+
+/// One value per primitive from those of the triangles that have one; zeros for the others.
+fn spread<T: Copy + Default>(records: &Records, values: &[[T; 3]], flag: u32) -> Vec<[T; 3]> {
+    let mut values = values.iter();
+    let mut out = Vec::with_capacity(records.len());
+    for extra in &records.extras {
+        let value = if extra.has & flag != 0 { values.next().copied() } else { None };
+        out.push(value.unwrap_or_default());
+    }
+    out.resize(records.len(), [T::default(); 3]);
+    out
+}

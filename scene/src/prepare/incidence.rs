@@ -1,0 +1,173 @@
+//! Which cells of the chosen grid a split's primitives lie in, and which of them must be copied.
+
+use super::records::Records;
+use crate::grid::Lattice;
+use crate::grid::count::{Counter, Inside};
+use crate::grid::lattice::{round_down, round_up};
+use crate::grid::touch::{Bounds, sphere_cells, sphere_in_cell, triangle_cells, triangle_in_cell};
+
+/// The occupied cells of the chosen subdivision. A cell's *number* is its place among them.
+#[derive(Debug)]
+pub(crate) struct ChosenCells {
+    pub lattice: Lattice,
+    /// Lattice index by number, ascending.
+    pub indices: Vec<u32>,
+    /// Primitives by number.
+    pub primitives: Vec<u32>,
+    /// Whether several splits claim the cell, by number.
+    pub contested: Vec<bool>,
+    /// Number by lattice index; [`ABSENT`] where nothing is.
+    numbers: Vec<u32>,
+}
+
+/// Not a number of a cell, group or split.
+pub(crate) const ABSENT: u32 = u32::MAX;
+
+impl ChosenCells {
+    pub(crate) fn new(counter: &Counter) -> Self {
+        let lattice = counter.lattice().clone();
+        let mut cells = ChosenCells {
+            numbers: vec![ABSENT; lattice.len()],
+            lattice,
+            indices: Vec::new(),
+            primitives: Vec::new(),
+            contested: Vec::new(),
+        };
+        for (index, primitives, owners) in counter.occupied() {
+            cells.numbers[index as usize] = cells.indices.len() as u32;
+            cells.indices.push(index);
+            cells.primitives.push(primitives);
+            cells.contested.push(owners > 1);
+        }
+        cells
+    }
+
+    pub(crate) fn len(&self) -> usize {
+        self.indices.len()
+    }
+
+    fn number(&self, at: [u32; 3]) -> usize {
+        self.numbers[self.lattice.index(at) as usize] as usize
+    }
+}
+
+/// Box of what is in a cell; empty when `lo > hi`.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) struct CellBox {
+    pub lo: [f32; 3],
+    pub hi: [f32; 3],
+}
+
+impl CellBox {
+    pub(crate) const EMPTY: CellBox = CellBox { lo: [f32::INFINITY; 3], hi: [f32::NEG_INFINITY; 3] };
+
+    pub(crate) fn is_empty(&self) -> bool {
+        self.lo[0] > self.hi[0]
+    }
+
+    pub(crate) fn add(&mut self, other: &CellBox) {
+        for a in 0..3 {
+            self.lo[a] = self.lo[a].min(other.lo[a]);
+            self.hi[a] = self.hi[a].max(other.hi[a]);
+        }
+    }
+
+    fn outwards((lo, hi): Bounds) -> CellBox {
+        CellBox { lo: lo.map(round_down), hi: hi.map(round_up) }
+    }
+}
+
+/// What a split has to do with the grid.
+#[derive(Debug)]
+pub(crate) struct Incidence {
+    /// Numbers of the cells that its primitives lie in, ascending, with the box of what of them is there.
+    pub cells: Vec<(u32, CellBox)>,
+    /// (triangle, group of contested cells), ascending, each once.
+    pub triangles: Vec<(u32, u32)>,
+    /// (sphere, group of contested cells), ascending, each once.
+    pub spheres: Vec<(u32, u32)>,
+    /// Primitives in at least one contested cell.
+    pub contested: u64,
+}
+
+/// Finds the cells of a split's primitives. `groups` gives by cell number the group that a contested cell is copied
+/// with; it is empty when nothing is copied.
+pub(crate) fn incidence(cells: &ChosenCells, groups: &[u32], records: &Records) -> Incidence {
+    let mut boxes = vec![CellBox::EMPTY; cells.len()];
+    let mut out = Incidence { cells: Vec::new(), triangles: Vec::new(), spheres: Vec::new(), contested: 0 };
+    let magnitude = cells.lattice.magnitude();
+    let mut touched = Vec::new();
+    let mut inside = Inside::NOWHERE;
+    let mut inside_number = 0;
+    for (i, p) in records.triangles.iter().enumerate() {
+        touched.clear();
+        if inside.holds(p) {
+            touched.push(inside_number);
+            boxes[inside_number].add(&box_of(p));
+        } else {
+            let exact = p.map(|v| v.map(f64::from));
+            let mut only = [0; 3];
+            triangle_cells(&cells.lattice, &exact, &mut |at| {
+                only = at;
+                touched.push(cells.number(at));
+                if let Some(part) = triangle_in_cell(&exact, &cells.lattice.cell_box(at), magnitude) {
+                    boxes[cells.number(at)].add(&CellBox::outwards(part));
+                }
+            });
+            if let [number] = touched[..] {
+                inside = Inside::new(&cells.lattice, only);
+                inside_number = number;
+            }
+        }
+        out.contested += u64::from(copy(cells, groups, &touched, i as u32, &mut out.triangles));
+    }
+    for (i, s) in records.spheres.iter().enumerate() {
+        touched.clear();
+        let (center, radius) = (s.center.map(f64::from), f64::from(s.radius));
+        sphere_cells(&cells.lattice, center, radius, &mut |at| {
+            touched.push(cells.number(at));
+            if let Some(part) = sphere_in_cell(center, radius, &cells.lattice.cell_box(at)) {
+                boxes[cells.number(at)].add(&CellBox::outwards(part));
+            }
+        });
+        out.contested += u64::from(copy(cells, groups, &touched, i as u32, &mut out.spheres));
+    }
+    out.cells = (0..).zip(boxes).filter(|(_, b)| !b.is_empty()).collect();
+    out
+}
+
+/// Notes the groups that a primitive must be copied into; whether any of its cells is contested.
+fn copy(cells: &ChosenCells, groups: &[u32], touched: &[usize], primitive: u32, pairs: &mut Vec<(u32, u32)>) -> bool {
+    let before = pairs.len();
+    let mut contested = false;
+    for &number in touched.iter().filter(|&&n| cells.contested[n]) {
+        contested = true;
+        if let Some(&group) = groups.get(number) {
+            pairs.push((primitive, group));
+        }
+    }
+    if pairs.len() > before + 1 {
+        pairs[before..].sort_unstable();
+        let mut keep = before + 1;
+        for i in before + 1..pairs.len() {
+            if pairs[i] != pairs[keep - 1] {
+                pairs[keep] = pairs[i];
+                keep += 1;
+            }
+        }
+        pairs.truncate(keep);
+    }
+    contested
+}
+
+/// Box of a triangle.
+pub(crate) fn box_of(p: &[[f32; 3]; 3]) -> CellBox {
+    let mut out = CellBox { lo: p[0], hi: p[0] };
+    for v in &p[1..] {
+        for a in 0..3 {
+            out.lo[a] = out.lo[a].min(v[a]);
+            out.hi[a] = out.hi[a].max(v[a]);
+        }
+    }
+    out
+}

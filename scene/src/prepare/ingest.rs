@@ -1,0 +1,261 @@
+//! Reading the source: its bounds, then its records, recentred and checked.
+
+use rayherd_render::bvh::MAX_COORDINATE;
+use rayherd_render::ray::PrimId;
+use rayherd_render::world::{EmissivePrimitive, Primitive};
+
+use super::progress::{PrepareProgress, Stage};
+use super::records::{Extra, NORMALS, Records, SphereBits, UVS};
+use super::spool::Spool;
+use super::{PrepareError, SpoolSettings};
+use crate::description::Description;
+use crate::grid::lattice::{round_down, round_up};
+use crate::manifest::Counts;
+use crate::record::{Record, RecordSource, SphereRecord, TriangleRecord};
+
+/// Records asked for at a time.
+const BATCH: usize = 4096;
+/// Primitives in a chunk of the spool.
+const CHUNK: usize = 16_384;
+/// Source coordinates beyond this are not used. Recentring at most doubles it, which blocks can still hold.
+const LARGEST: f64 = (MAX_COORDINATE / 2.0) as f64;
+
+/// Bounds of a source, f64.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) struct SourceBounds {
+    pub lo: [f64; 3],
+    pub hi: [f64; 3],
+    /// Bytes read to find them.
+    pub bytes: u64,
+}
+
+/// All usable records, and what they are together.
+#[derive(Debug)]
+pub(crate) struct Ingested {
+    pub spool: Spool,
+    pub counts: Counts,
+    pub lo: [f32; 3],
+    pub hi: [f32; 3],
+    pub emissive: Vec<EmissivePrimitive>,
+    /// Of all records, whatever the chunks.
+    pub hash: blake3::Hash,
+}
+
+/// Why a record is skipped.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Skip {
+    Degenerate,
+    NonFinite,
+    OutOfRange,
+}
+
+/// A pass over the source that finds its bounds.
+pub(crate) fn bounds(
+    source: &dyn RecordSource,
+    progress: &dyn PrepareProgress,
+) -> Result<Option<SourceBounds>, PrepareError> {
+    let mut stream = source.open()?;
+    progress.begin(Stage::Bounds, None);
+    let (mut lo, mut hi) = ([f64::INFINITY; 3], [f64::NEG_INFINITY; 3]);
+    let mut batch = Vec::with_capacity(BATCH);
+    loop {
+        batch.clear();
+        let n = stream.next(&mut batch, BATCH)?;
+        if n == 0 {
+            break;
+        }
+        progress.advance(n as u64);
+        for record in &batch {
+            if sound(record).is_err() {
+                continue;
+            }
+            let mut add = |p: [f64; 3], r: f64| {
+                for a in 0..3 {
+                    lo[a] = lo[a].min(p[a] - r);
+                    hi[a] = hi[a].max(p[a] + r);
+                }
+            };
+            match record {
+                Record::Triangle(t) => t.p.iter().for_each(|p| add(*p, 0.0)),
+                Record::Sphere(s) => add(s.center, s.radius),
+            }
+        }
+    }
+    Ok((lo[0] <= hi[0]).then_some(SourceBounds { lo, hi, bytes: stream.bytes_read() }))
+}
+
+/// Whether bounds that an importer found can be used.
+pub(crate) fn usable_bounds(bounds: &[[f64; 3]; 2]) -> bool {
+    (0..3).all(|a| bounds[0][a] <= bounds[1][a] && bounds[0][a] >= -LARGEST && bounds[1][a] <= LARGEST)
+}
+
+/// The pass that reads every record into the spool.
+pub(crate) fn ingest(
+    description: &Description,
+    source: &dyn RecordSource,
+    offset: [f64; 3],
+    settings: &SpoolSettings,
+    progress: &dyn PrepareProgress,
+) -> Result<Ingested, PrepareError> {
+    let mut stream = source.open()?;
+    progress.begin(Stage::Reading, None);
+    let mut reader = Reader {
+        offset,
+        description,
+        chunk: Records::default(),
+        spool: Spool::new(settings),
+        counts: Counts::default(),
+        lo: [f32::INFINITY; 3],
+        hi: [f32::NEG_INFINITY; 3],
+        emissive: Vec::new(),
+        hashers: Default::default(),
+    };
+    let mut batch = Vec::with_capacity(BATCH);
+    loop {
+        batch.clear();
+        let n = stream.next(&mut batch, BATCH)?;
+        if n == 0 {
+            break;
+        }
+        progress.advance(n as u64);
+        for record in &batch {
+            reader.add(record)?;
+        }
+    }
+    reader.counts.source_bytes = stream.bytes_read();
+    reader.flush()?;
+    let mut hasher = blake3::Hasher::new();
+    for part in &reader.hashers {
+        hasher.update(part.finalize().as_bytes());
+    }
+    let Reader { spool, counts, lo, hi, emissive, .. } = reader;
+    Ok(Ingested { spool, counts, lo, hi, emissive, hash: hasher.finalize() })
+}
+
+struct Reader<'a> {
+    offset: [f64; 3],
+    description: &'a Description,
+    chunk: Records,
+    spool: Spool,
+    counts: Counts,
+    lo: [f32; 3],
+    hi: [f32; 3],
+    emissive: Vec<EmissivePrimitive>,
+    /// One for each array, so that the sum does not depend on where chunks end.
+    hashers: [blake3::Hasher; 7],
+}
+
+impl Reader<'_> {
+    fn add(&mut self, record: &Record) -> Result<(), PrepareError> {
+        let id = self.counts.records;
+        self.counts.records += 1;
+        let added = sound(record).and_then(|()| match record {
+            Record::Triangle(t) => self.triangle(id, t),
+            Record::Sphere(s) => self.sphere(id, s),
+        });
+        match added {
+            Ok(()) => {}
+            Err(Skip::Degenerate) => self.counts.degenerate += 1,
+            Err(Skip::NonFinite) => self.counts.non_finite += 1,
+            Err(Skip::OutOfRange) => self.counts.out_of_range += 1,
+        }
+        if self.chunk.len() >= CHUNK { self.flush() } else { Ok(()) }
+    }
+
+    fn triangle(&mut self, id: PrimId, t: &TriangleRecord) -> Result<(), Skip> {
+        let p: [[f32; 3]; 3] = t.p.map(|p| std::array::from_fn(|a| (p[a] - self.offset[a]) as f32));
+        if zero_area(&p) {
+            return Err(Skip::Degenerate);
+        }
+        for v in &p {
+            for a in 0..3 {
+                self.lo[a] = self.lo[a].min(v[a]);
+                self.hi[a] = self.hi[a].max(v[a]);
+            }
+        }
+        self.chunk.triangle_ids.push(id);
+        self.chunk.triangles.push(p);
+        let mut has = 0;
+        if let Some(n) = t.n {
+            has |= NORMALS;
+            self.chunk.normals.push(n);
+        }
+        if let Some(uv) = t.uv {
+            has |= UVS;
+            self.chunk.uvs.push(uv);
+        }
+        self.chunk.extras.push(Extra { shape: t.shape, has });
+        self.counts.triangles += 1;
+        self.emit(id, t.shape, Primitive::Triangle(p));
+        Ok(())
+    }
+
+    fn sphere(&mut self, id: PrimId, s: &SphereRecord) -> Result<(), Skip> {
+        let center: [f32; 3] = std::array::from_fn(|a| (s.center[a] - self.offset[a]) as f32);
+        let radius = s.radius as f32;
+        if radius <= 0.0 {
+            return Err(Skip::Degenerate);
+        }
+        for a in 0..3 {
+            self.lo[a] = self.lo[a].min(round_down(f64::from(center[a]) - f64::from(radius)));
+            self.hi[a] = self.hi[a].max(round_up(f64::from(center[a]) + f64::from(radius)));
+        }
+        self.chunk.sphere_ids.push(id);
+        self.chunk.spheres.push(SphereBits { center, radius, shape: s.shape, flipped: u32::from(s.flipped) });
+        self.counts.spheres += 1;
+        self.emit(id, s.shape, Primitive::Sphere { center, radius, flipped: s.flipped });
+        Ok(())
+    }
+
+    fn emit(&mut self, prim: PrimId, shape: u32, geometry: Primitive) {
+        let emission = self.description.shapes.get(shape as usize).and_then(|s| s.emission);
+        if emission.is_some_and(|e| e.iter().any(|&x| x > 0.0)) {
+            self.emissive.push(EmissivePrimitive { prim, shape, geometry });
+        }
+    }
+
+    fn flush(&mut self) -> Result<(), PrepareError> {
+        let chunk = std::mem::take(&mut self.chunk);
+        if chunk.len() == 0 {
+            return Ok(());
+        }
+        let [ids, triangles, extras, normals, uvs, sphere_ids, spheres] = &mut self.hashers;
+        ids.update(bytemuck::cast_slice(&chunk.triangle_ids));
+        triangles.update(bytemuck::cast_slice(&chunk.triangles));
+        extras.update(bytemuck::cast_slice(&chunk.extras));
+        normals.update(bytemuck::cast_slice(&chunk.normals));
+        uvs.update(bytemuck::cast_slice(&chunk.uvs));
+        sphere_ids.update(bytemuck::cast_slice(&chunk.sphere_ids));
+        spheres.update(bytemuck::cast_slice(&chunk.spheres));
+        self.spool.push(chunk).map_err(|source| PrepareError::Spool { folder: self.spool.folder().clone(), source })?;
+        Ok(())
+    }
+}
+
+/// Whether a record's numbers can be computed with.
+fn sound(record: &Record) -> Result<(), Skip> {
+    let (finite, within) = match record {
+        Record::Triangle(t) => {
+            let largest = t.p.as_flattened().iter().fold(0.0f64, |m, x| m.max(x.abs()));
+            // max() ignores NaN
+            (t.p.as_flattened().iter().all(|x| x.is_finite()), largest <= LARGEST)
+        }
+        Record::Sphere(s) => {
+            let largest = s.center.iter().fold(0.0f64, |m, x| m.max(x.abs())) + s.radius;
+            (s.center.iter().all(|x| x.is_finite()) && s.radius.is_finite(), largest <= LARGEST)
+        }
+    };
+    match (finite, within) {
+        (false, _) => Err(Skip::NonFinite),
+        (true, false) => Err(Skip::OutOfRange),
+        (true, true) => Ok(()),
+    }
+}
+
+/// Whether a triangle's area vanishes: its cross product is zero in f64. Differences of f32 are exact there (but for
+/// exponents more than 29 apart), and so are their products.
+fn zero_area(p: &[[f32; 3]; 3]) -> bool {
+    let edge = |j: usize| -> [f64; 3] { std::array::from_fn(|a| f64::from(p[j][a]) - f64::from(p[0][a])) };
+    let (a, b) = (edge(1), edge(2));
+    a[1] * b[2] == a[2] * b[1] && a[2] * b[0] == a[0] * b[2] && a[0] * b[1] == a[1] * b[0]
+}
