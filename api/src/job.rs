@@ -172,7 +172,7 @@ pub struct SamplingSpec {
     pub rr_depth: Option<i32>,
     /// Paths that go on from the first hit of each sample; 1 by default.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    #[schemars(range(min = 1, max = 65535))]
+    #[schemars(range(min = 1, max = 512))]
     pub split: Option<i32>,
     /// Seed of every random number; 0 by default.
     #[serde(default, skip_serializing_if = "Option::is_none")]

@@ -56,7 +56,7 @@ pub fn validate(job: &RenderJob) -> Vec<Problem> {
     }
     c.range("spec.sampling.maxDepth", integer(sampling.max_depth), 1.0, 65535.0);
     c.range("spec.sampling.rrDepth", integer(sampling.rr_depth), 1.0, 65535.0);
-    c.range("spec.sampling.split", integer(sampling.split), 1.0, 65535.0);
+    c.range("spec.sampling.split", integer(sampling.split), 1.0, 512.0);
     if let Some(seed) = sampling.seed {
         c.check("spec.sampling.seed", seed >= 0, || format!("is {seed}: give 0 or more"));
     }

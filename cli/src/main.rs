@@ -1,3 +1,40 @@
 //! `rayherd`: renders, prepares, compares, replays.
 
-fn main() {}
+mod commands;
+mod fault;
+mod log;
+mod output;
+
+use std::process::ExitCode;
+
+use clap::Parser;
+
+/// A path tracer for scenes that do not fit one machine: rays go to the data.
+#[derive(Parser)]
+#[command(
+    name = "rayherd",
+    version,
+    max_term_width = 110,
+    after_help = "Start with:  rayherd render examples/cornell-box.xml\n\
+                  Logs go to stderr; RUST_LOG=info (or debug) shows more of them."
+)]
+struct Arguments {
+    #[command(subcommand)]
+    command: commands::Command,
+}
+
+fn main() -> ExitCode {
+    fault::install_panic_hook();
+    // prints help and mistakes by itself, and exits with 2 for a mistake
+    let arguments = Arguments::parse();
+    log::install();
+    match std::panic::catch_unwind(|| commands::run(arguments.command)) {
+        Ok(Ok(code)) => code,
+        Ok(Err(error)) => {
+            eprintln!("error: {error:#}");
+            fault::exit_code(&error).into()
+        }
+        // the panic hook has told it
+        Err(_) => ExitCode::FAILURE,
+    }
+}

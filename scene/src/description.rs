@@ -97,7 +97,7 @@ pub enum Geometry {
 }
 
 /// Mesh file formats.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 pub enum MeshFormat {
     /// Stanford PLY: ascii, little or big endian, polygons fanned.
     Ply,

@@ -1,46 +1,184 @@
 //! Reading scenes: a file or folder of any supported format to a [`Description`], and its records.
 
+mod bare;
+mod bounds;
+mod framing;
 pub mod isosurface;
+mod mesh;
 mod mitsuba;
+mod obj;
+mod options;
 mod placement;
+mod ply;
 mod shapes;
+mod source;
+mod spill;
+mod stl;
 mod stream;
 pub(crate) mod vector;
 pub mod volume;
 
+use std::io::Read;
 use std::path::Path;
 
+pub use bounds::bounds;
+pub use options::{
+    CameraView, DEFAULT_ALBEDO, ImportOptions, Light, OptionError, parse_albedo, parse_define, parse_radiance,
+};
 pub use placement::Placement;
 pub use stream::{DescriptionSource, StreamOptions};
 
 use crate::ImportError;
-use crate::description::{Description, Place};
+use crate::description::{Bsdf, Description, Material, MeshFormat, Place};
+use framing::Up;
 
-/// What the caller decides about an import.
-#[derive(Clone, Debug, Default)]
-pub struct ImportOptions {
-    /// Unsupported elements are replaced by named stand-ins instead of being an error.
-    pub substitute: bool,
-    /// Values of a Mitsuba scene's `$names`; they win over its defaults. A name that the scene lacks is an error.
-    pub defines: Vec<(String, String)>,
-    /// Width and height instead of the source's; a field of view along y follows it.
-    pub size: Option<[u32; 2]>,
+/// What a path holds.
+enum Kind {
+    Mitsuba,
+    Mesh(MeshFormat),
+    Volume,
+    /// Meshes, or a DICOM series.
+    Folder,
 }
 
-/// Reads a scene.
+/// Reads a scene: a Mitsuba XML file, a mesh (PLY, OBJ, STL, also `.gz`), a folder of meshes, or with `options.iso` a volume.
 ///
 /// # Errors
-/// The file cannot be read, is malformed, or has elements that are not supported (all are listed).
+/// The file cannot be read, is malformed, has elements that are not supported (all are listed), or gives no light.
 pub fn import(path: &Path, options: &ImportOptions) -> Result<Description, ImportError> {
-    let description = mitsuba::import(path, options)?;
-    let lit = description.environment.is_some_and(|rgb| rgb.iter().any(|v| *v > 0.0))
-        || description.shapes.iter().any(|s| s.emission.is_some());
-    if !lit {
-        return Err(ImportError::Malformed {
-            place: Place { file: path.into(), line: 0 },
-            message: "nothing in this scene emits light, its image is black: add an emitter, or pass --light or --sky"
-                .into(),
-        });
+    let kind = kind(path)?;
+    let bare = !matches!(kind, Kind::Mitsuba);
+    let (mut out, up) = match kind {
+        Kind::Mitsuba => {
+            for (given, name) in [(options.iso.is_some(), "an iso value"), (options.albedo.is_some(), "an albedo")] {
+                if given {
+                    return refuse(
+                        path,
+                        format!("{name} was given, but an XML scene has its own surfaces: leave it out"),
+                    );
+                }
+            }
+            (mitsuba::import(path, options)?, Up::Y)
+        }
+        Kind::Mesh(format) => bare::meshes(path, &[(path.to_path_buf(), format)], options)?,
+        Kind::Volume => bare::volume(path, options)?,
+        Kind::Folder => match bare::meshes_in(path)? {
+            meshes if meshes.is_empty() => bare::volume(path, options)?,
+            meshes => bare::meshes(path, &meshes, options)?,
+        },
+    };
+    if out.shapes.is_empty() {
+        return refuse(path, "the scene has no shapes: there is nothing to render");
     }
-    Ok(description)
+    place_camera(path, &mut out, up, bare, options)?;
+    if let Some(sky) = options.sky {
+        out.environment = Some(sky);
+    }
+    out.environment = out.environment.filter(|rgb| rgb.iter().any(|v| *v > 0.0));
+    if out.environment.is_none() && out.shapes.iter().all(|s| s.emission.is_none()) {
+        return refuse(
+            path,
+            "nothing in this scene emits light, its image is black: add an emitter, or pass --light or --sky",
+        );
+    }
+    for s in &out.substitutions {
+        tracing::warn!("{}: {} is not supported; in its place: {}", s.place, s.what, s.stand_in);
+    }
+    Ok(out)
 }
+
+/// The camera that was asked for, or one that frames the scene if it has none; and the lights.
+fn place_camera(
+    path: &Path,
+    out: &mut Description,
+    up: Up,
+    bare: bool,
+    options: &ImportOptions,
+) -> Result<(), ImportError> {
+    if let Some(view) = &options.camera {
+        out.camera = Some(view.camera().or_else(|e| refuse(path, e.to_string()))?);
+    }
+    let mut lights = options.lights.clone();
+    if out.camera.is_none() || (bare && lights.is_empty()) {
+        let bounds = match out.bounds {
+            Some(bounds) => bounds,
+            None => bounds::measure(out)?,
+        };
+        let size = *out.size.get_or_insert(options.size.unwrap_or(framing::SIZE));
+        let Some(frame) = framing::frame(bounds, up, size) else {
+            return refuse(path, "no primitive with finite vertices and an extent: there is nothing to look at");
+        };
+        if out.camera.is_none() {
+            tracing::info!("the source has no camera; one is placed to frame it");
+            out.camera = Some(frame.camera);
+        }
+        if bare && lights.is_empty() {
+            lights.extend(frame.lights);
+        }
+        out.bounds = Some(bounds);
+    }
+    if lights.is_empty() {
+        return Ok(());
+    }
+    let material = out.materials.len() as u32;
+    let black = Bsdf::Diffuse { reflectance: [0.0; 3] };
+    out.materials.push(Material { name: "light".into(), bsdf: black, two_sided: false });
+    for (i, light) in lights.iter().enumerate() {
+        let Some(shape) = light.shape(format!("light-{}", i + 1), material) else {
+            return refuse(path, format!("light {} has no direction: its origin and target are one point", i + 1));
+        };
+        if let Some(bounds) = &mut out.bounds {
+            bounds::add_corners(bounds, &shape);
+        }
+        out.shapes.push(shape);
+    }
+    Ok(())
+}
+
+/// Tells what a path holds, by its content where that says it, else by its name.
+fn kind(path: &Path) -> Result<Kind, ImportError> {
+    let io = |source| ImportError::Io { path: path.into(), source };
+    let metadata = std::fs::metadata(path).map_err(io)?;
+    if metadata.is_dir() {
+        return Ok(Kind::Folder);
+    }
+    if !metadata.is_file() {
+        return refuse(path, "neither a file nor a folder");
+    }
+    let mut head = vec![];
+    std::fs::File::open(path).and_then(|file| file.take(256).read_to_end(&mut head)).map_err(io)?;
+    if head.is_empty() {
+        return refuse(path, "the file is empty");
+    }
+    let text = head.strip_prefix(b"\xef\xbb\xbf").unwrap_or(&head).trim_ascii_start();
+    if text.starts_with(b"<") {
+        return Ok(Kind::Mitsuba);
+    }
+    if head.starts_with(b"ply") && head.get(3).is_some_and(u8::is_ascii_whitespace) {
+        return Ok(Kind::Mesh(MeshFormat::Ply));
+    }
+    if head.starts_with(b"NRRD") {
+        return Ok(Kind::Volume);
+    }
+    if let Some(format) = bare::mesh_format(path) {
+        return Ok(Kind::Mesh(format));
+    }
+    match mesh::extension(path).as_str() {
+        "xml" => Ok(Kind::Mitsuba),
+        "nrrd" | "nhdr" | "nii" | "hdr" | "dcm" | "ima" => Ok(Kind::Volume),
+        _ if text.starts_with(b"solid") => Ok(Kind::Mesh(MeshFormat::Stl)),
+        _ => refuse(
+            path,
+            "this is no scene that can be read: Mitsuba .xml, .ply, .obj, .stl, a folder of meshes, or a volume (.nrrd, .nhdr, \
+             .nii, .nii.gz, a DICOM folder)",
+        ),
+    }
+}
+
+/// An error about the source as a whole.
+fn refuse<T>(path: &Path, message: impl Into<String>) -> Result<T, ImportError> {
+    Err(ImportError::Malformed { place: Place { file: path.into(), line: 0 }, message: message.into() })
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,45 +1,109 @@
 //! The records of a description, shape after shape.
 
+use std::path::{Path, PathBuf};
+use std::sync::OnceLock;
+use std::sync::atomic::{AtomicU64, Ordering};
+
+use super::isosurface::IsoSurfaceSource;
+use super::mesh::{MeshOptions, MeshStream};
+use super::obj::ObjReader;
 use super::placement::Placement;
+use super::ply::PlyReader;
+use super::stl::StlReader;
 use crate::ImportError;
-use crate::description::{Description, Geometry, Shape};
+use crate::description::{Description, Geometry, MeshFormat, Shape};
 use crate::record::{Record, RecordSource, RecordStream, SphereRecord};
 
 /// How much memory reading may take.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Debug)]
 pub struct StreamOptions {
     /// Most bytes of one mesh's vertex arrays in memory; larger ones spill to a mapped temporary file.
     pub vertex_budget: u64,
+    /// Most bytes of that file; a mesh that needs more is an error.
+    pub spill_limit: u64,
+    /// Its folder; the system's temporary folder when `None`.
+    pub spill_folder: Option<PathBuf>,
 }
 
 impl Default for StreamOptions {
+    /// 512 MiB in memory, then up to 64 GiB in the system's temporary folder.
     fn default() -> Self {
-        StreamOptions { vertex_budget: 512 << 20 }
+        StreamOptions { vertex_budget: 512 << 20, spill_limit: 64 << 30, spill_folder: None }
     }
 }
 
 /// A description as a source of records.
-#[derive(Clone, Copy, Debug)]
+#[derive(Debug)]
 pub struct DescriptionSource<'a> {
     description: &'a Description,
     options: StreamOptions,
+    spilled: AtomicU64,
+    /// By shape: volumes that have been opened.
+    volumes: Vec<Option<OnceLock<IsoSurfaceSource>>>,
 }
 
 impl<'a> DescriptionSource<'a> {
     /// The records of `description`, in the order of its shapes.
     pub fn new(description: &'a Description, options: StreamOptions) -> Self {
-        DescriptionSource { description, options }
+        let is_volume = |s: &Shape| matches!(s.geometry, Geometry::IsoSurface { .. });
+        let volumes = description.shapes.iter().map(|s| is_volume(s).then(OnceLock::new)).collect();
+        DescriptionSource { description, options, spilled: AtomicU64::new(0), volumes }
+    }
+
+    /// The surface of a volume; its headers are read once for all passes.
+    fn surface(&self, number: usize, path: &Path, iso: f64, shape: &Shape) -> Result<&IsoSurfaceSource, ImportError> {
+        let Some(slot) = &self.volumes[number] else { unreachable!("made for each surface of a volume") };
+        if slot.get().is_none() {
+            let source = IsoSurfaceSource::new(path, iso)?.placed(&shape.to_world, number as u32);
+            // two passes that begin at once read the headers twice; the first to finish is kept
+            let _ = slot.set(source);
+        }
+        let Some(source) = slot.get() else { unreachable!("set above") };
+        Ok(source)
+    }
+
+    /// Bytes of vertex arrays that went to temporary files, over all passes so far.
+    pub fn spilled_bytes(&self) -> u64 {
+        self.spilled.load(Ordering::Relaxed)
+    }
+
+    /// The records of one shape.
+    fn open_shape(&self, number: usize, shape: &'a Shape) -> Result<Box<dyn RecordStream + '_>, ImportError> {
+        let number = number as u32;
+        let placement = Placement::new(shape, number);
+        Ok(match &shape.geometry {
+            Geometry::Inline { positions, uv, triangles } => {
+                Box::new(InlineStream { placement, positions, uv, triangles: triangles.iter() })
+            }
+            Geometry::Sphere { center, radius } => Box::new(Once(Some(sphere(shape, number, *center, *radius)))),
+            Geometry::MeshFile { path, format, flip_v, smooth } => {
+                let options = MeshOptions { placement, flip_v: *flip_v, smooth: *smooth, spilled: &self.spilled };
+                match format {
+                    MeshFormat::Ply => Box::new(MeshStream::new(PlyReader::open(path, &self.options)?, options)?),
+                    MeshFormat::Obj => Box::new(MeshStream::new(ObjReader::open(path, &self.options)?, options)?),
+                    MeshFormat::Stl => {
+                        // a format without vertices that triangles share has nothing to smooth
+                        let options = MeshOptions { smooth: false, ..options };
+                        Box::new(MeshStream::new(StlReader::open(path, &self.options)?, options)?)
+                    }
+                }
+            }
+            Geometry::IsoSurface { path, iso } => {
+                let records = self.surface(number as usize, path, *iso, shape)?.open()?;
+                if shape.flip_normals { Box::new(Flipped(records)) } else { records }
+            }
+        })
     }
 }
 
 impl RecordSource for DescriptionSource<'_> {
     fn open(&self) -> Result<Box<dyn RecordStream + '_>, ImportError> {
-        Ok(Box::new(DescriptionStream { source: *self, shape: 0, current: None, bytes_read: 0 }))
+        Ok(Box::new(DescriptionStream { source: self, shape: 0, current: None, bytes_read: 0 }))
     }
 }
 
 struct DescriptionStream<'a> {
-    source: DescriptionSource<'a>,
+    source: &'a DescriptionSource<'a>,
     /// The shape after the current one.
     shape: usize,
     current: Option<Box<dyn RecordStream + 'a>>,
@@ -60,7 +124,7 @@ impl RecordStream for DescriptionStream<'_> {
                     n => appended += n,
                 }
             } else if let Some(shape) = self.source.description.shapes.get(self.shape) {
-                self.current = Some(open_shape(shape, self.shape as u32, self.source.options)?);
+                self.current = Some(self.source.open_shape(self.shape, shape)?);
                 self.shape += 1;
             } else {
                 break;
@@ -72,21 +136,6 @@ impl RecordStream for DescriptionStream<'_> {
     fn bytes_read(&self) -> u64 {
         self.bytes_read + self.current.as_ref().map_or(0, |c| c.bytes_read())
     }
-}
-
-/// The records of one shape.
-fn open_shape(shape: &Shape, number: u32, options: StreamOptions) -> Result<Box<dyn RecordStream + '_>, ImportError> {
-    let placement = Placement::new(shape, number);
-    Ok(match &shape.geometry {
-        Geometry::Inline { positions, uv, triangles } => {
-            Box::new(InlineStream { placement, positions, uv, triangles: triangles.iter() })
-        }
-        Geometry::Sphere { center, radius } => Box::new(Once(Some(sphere(shape, number, *center, *radius)))),
-        Geometry::MeshFile { path, .. } | Geometry::IsoSurface { path, .. } => {
-            let message = format!("cannot be read yet (vertex budget {})", options.vertex_budget);
-            return Err(ImportError::Limit { path: path.clone(), message });
-        }
-    })
 }
 
 /// A sphere under a similarity.
@@ -133,5 +182,24 @@ impl RecordStream for InlineStream<'_> {
     }
     fn bytes_read(&self) -> u64 {
         0
+    }
+}
+
+/// Triangles turned round.
+struct Flipped<'a>(Box<dyn RecordStream + 'a>);
+
+impl RecordStream for Flipped<'_> {
+    fn next(&mut self, out: &mut Vec<Record>, max: usize) -> Result<usize, ImportError> {
+        let before = out.len();
+        let n = self.0.next(out, max)?;
+        for record in &mut out[before..] {
+            if let Record::Triangle(t) = record {
+                t.p.swap(1, 2);
+            }
+        }
+        Ok(n)
+    }
+    fn bytes_read(&self) -> u64 {
+        self.0.bytes_read()
     }
 }

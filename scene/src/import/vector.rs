@@ -36,3 +36,8 @@ pub(crate) fn cofactors(map: &Affine) -> [[f64; 3]; 3] {
     let [a, b, c] = map.0.map(|r| [r[0], r[1], r[2]]);
     [cross(b, c), cross(c, a), cross(a, b)]
 }
+
+/// `a + s b`.
+pub(crate) fn add_scaled(a: [f64; 3], s: f64, b: [f64; 3]) -> [f64; 3] {
+    [a[0] + s * b[0], a[1] + s * b[1], a[2] + s * b[2]]
+}

@@ -1,0 +1,33 @@
+//! The commands, one a file.
+
+mod compare;
+mod inspect;
+
+use std::io::Write;
+use std::process::ExitCode;
+
+use clap::Subcommand;
+
+/// What to do.
+#[derive(Subcommand)]
+pub enum Command {
+    Compare(compare::Arguments),
+    Inspect(inspect::Arguments),
+}
+
+/// Does it. The code is the command's answer; an error is told by the caller.
+pub fn run(command: Command) -> anyhow::Result<ExitCode> {
+    match command {
+        Command::Compare(arguments) => compare::run(&arguments),
+        Command::Inspect(arguments) => inspect::run(&arguments),
+    }
+}
+
+/// Prints to stdout. A reader that has gone (`| head`) has seen enough: that is no error.
+fn print(text: &str) -> anyhow::Result<()> {
+    let mut out = std::io::stdout().lock();
+    match out.write_all(text.as_bytes()).and_then(|()| out.flush()) {
+        Err(e) if e.kind() != std::io::ErrorKind::BrokenPipe => Err(e.into()),
+        _ => Ok(()),
+    }
+}

@@ -1,0 +1,166 @@
+//! OpenEXR: linear 32-bit float RGB out, any flat scanline or tiled picture in.
+
+use std::collections::BTreeMap;
+use std::fs;
+use std::io::Cursor;
+use std::path::Path;
+
+use anyhow::anyhow;
+use exr::prelude::{
+    Encoding, FlatImage, FlatSamples, Image, ImageAttributes, IntegerBounds, Layer, LayerAttributes, MetaData,
+    ReadChannels, ReadLayers, SpecificChannels, Text, WritableImage,
+};
+use serde_json::{Map, Value};
+
+use super::Picture;
+use crate::fault::Mistake;
+
+/// The attribute that holds what defines the image, as one JSON object.
+///
+/// One, because the exr crate writes attributes in the order of a hash map, which differs from run to run.
+pub const ATTRIBUTE: &str = "rayherd";
+
+/// Encodes `picture` with `definition` in its header. The same arguments give the same bytes: compression and order of
+/// lines are fixed, and nothing tells of time, host or threads.
+#[cfg_attr(not(test), expect(dead_code, reason = "rendering, which comes with herd's job, is its only user"))]
+pub fn encode(picture: &Picture, definition: &Map<String, Value>) -> anyhow::Result<Vec<u8>> {
+    let width = picture.width as usize;
+    let channels = SpecificChannels::rgb(|at: exr::math::Vec2<usize>| {
+        let [r, g, b] = picture.pixels[at.y() * width + at.x()];
+        (r, g, b)
+    });
+    let size = (width, picture.height() as usize);
+    let encoding = Encoding { line_order: exr::meta::attribute::LineOrder::Increasing, ..Encoding::SMALL_LOSSLESS };
+    let mut attributes = LayerAttributes::default();
+    let text = Value::Object(definition.clone()).to_string();
+    let text = Text::new_or_none(text).ok_or_else(|| anyhow!("the image's definition does not fit an EXR header"))?;
+    attributes.other.insert(Text::from(ATTRIBUTE), exr::meta::attribute::AttributeValue::Text(text));
+    attributes.software_name = Some(Text::from(concat!("rayherd ", env!("CARGO_PKG_VERSION"))));
+    let image = Image {
+        attributes: ImageAttributes::new(IntegerBounds::from_dimensions(size)),
+        layer_data: Layer::new(size, attributes, encoding, channels),
+    };
+    let mut bytes = Cursor::new(Vec::new());
+    image.write().to_buffered(&mut bytes).map_err(|e| anyhow!("cannot encode an EXR: {e}"))?;
+    Ok(bytes.into_inner())
+}
+
+/// The channels of an EXR file by name (`LAYER.NAME` when there are layers), as f32, rows from the top.
+pub struct Channels {
+    /// Pixels in a row.
+    pub width: usize,
+    /// Rows.
+    pub height: usize,
+    /// By name, ascending.
+    pub values: BTreeMap<String, Vec<f32>>,
+}
+
+/// No compression of OpenEXR does better than deflate, which makes at most 1032 bytes of one; more than that is a lie
+/// about the size, found before memory is taken.
+const MOST_EXPANSION: u64 = 1100;
+
+/// Reads every channel of a file's first size level. Layers must have one size.
+pub fn read(path: &Path) -> anyhow::Result<Channels> {
+    let mistake = |why: String| Mistake(format!("{}: {why}", path.display()));
+    let bytes = fs::read(path).map_err(|e| Mistake(format!("cannot read {}: {e}", path.display())))?;
+    let meta = MetaData::read_from_buffered(Cursor::new(&bytes), false)
+        .map_err(|e| mistake(format!("is no EXR file: {e}")))?;
+    let claimed = meta.headers.iter().map(|h| h.total_pixel_bytes() as u64).fold(0, u64::saturating_add);
+    if claimed > bytes.len() as u64 * MOST_EXPANSION {
+        let message = format!("is damaged: its header claims {claimed} bytes of pixels in a file of {}", bytes.len());
+        return Err(mistake(message).into());
+    }
+    let image: FlatImage = exr::prelude::read()
+        .no_deep_data()
+        .largest_resolution_level()
+        .all_channels()
+        .all_layers()
+        .all_attributes()
+        .from_buffered(Cursor::new(&bytes))
+        .map_err(|e| mistake(format!("cannot be read as EXR: {e}")))?;
+    collect(image).map_err(|e| mistake(e).into())
+}
+
+fn collect(image: FlatImage) -> Result<Channels, String> {
+    let size = image.layer_data.first().ok_or("has no layer")?.size;
+    let mut values = BTreeMap::new();
+    for layer in image.layer_data {
+        if layer.size != size {
+            return Err(format!("has layers of different sizes ({size:?} and {:?})", layer.size));
+        }
+        for channel in layer.channel_data.list {
+            if channel.sampling != exr::math::Vec2(1, 1) {
+                return Err(format!("has a subsampled channel {}", channel.name));
+            }
+            let samples = match channel.sample_data {
+                FlatSamples::F32(v) => v,
+                FlatSamples::F16(v) => v.into_iter().map(f32::from).collect(),
+                FlatSamples::U32(v) => v.into_iter().map(|v| v as f32).collect(),
+            };
+            let name = match &layer.attributes.layer_name {
+                Some(layer) => format!("{layer}.{}", channel.name),
+                None => channel.name.to_string(),
+            };
+            if values.insert(name.clone(), samples).is_some() {
+                return Err(format!("has channel {name} twice"));
+            }
+        }
+    }
+    Ok(Channels { width: size.x(), height: size.y(), values })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn picture() -> Picture {
+        let pixels = (0..70 * 40).map(|i| [i as f32, -0.5 * i as f32, 1.0 / (1.0 + i as f32)]).collect();
+        Picture { width: 70, pixels }
+    }
+
+    fn definition() -> Map<String, Value> {
+        let Value::Object(map) = serde_json::json!({"spp": 16, "seed": 3, "scene": "abc"}) else { unreachable!() };
+        map
+    }
+
+    #[test]
+    fn the_same_picture_is_the_same_bytes_and_comes_back() {
+        let bytes = encode(&picture(), &definition()).unwrap();
+        for _ in 0..4 {
+            assert_eq!(encode(&picture(), &definition()).unwrap(), bytes);
+        }
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("a.exr");
+        fs::write(&path, &bytes).unwrap();
+        let channels = read(&path).unwrap();
+        assert_eq!((channels.width, channels.height), (70, 40));
+        assert_eq!(channels.values.keys().collect::<Vec<_>>(), ["B", "G", "R"]);
+        for (i, name) in ["R", "G", "B"].iter().enumerate() {
+            assert!(channels.values[*name].iter().zip(&picture().pixels).all(|(v, p)| *v == p[i]));
+        }
+        let meta = MetaData::read_from_file(&path, true).unwrap();
+        let attribute = &meta.headers[0].own_attributes.other[&Text::from(ATTRIBUTE)];
+        let text = attribute.to_text().unwrap().to_string();
+        assert_eq!(text, r#"{"scene":"abc","seed":3,"spp":16}"#);
+    }
+
+    #[test]
+    fn damaged_files_are_errors() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("a.exr");
+        let good = encode(&picture(), &definition()).unwrap();
+        for bad in [&good[..0], &good[..40], &good[..good.len() / 2], &b"no picture at all"[..]] {
+            fs::write(&path, bad).unwrap();
+            let error = read(&path).err().unwrap().to_string();
+            assert!(error.contains("a.exr"), "{error}");
+        }
+        // a window of 2^30 x 40 pixels in a file of a few kilobytes
+        let mut huge = good.clone();
+        let at = huge.windows(10).position(|w| w == b"dataWindow").unwrap() + 10 + 1 + 6 + 4;
+        assert_eq!(huge[at + 8..at + 12], 69i32.to_le_bytes());
+        huge[at + 8..at + 12].copy_from_slice(&((1i32 << 30) - 1).to_le_bytes());
+        fs::write(&path, huge).unwrap();
+        let error = read(&path).err().unwrap().to_string();
+        assert!(error.contains("a.exr"), "{error}");
+    }
+}

@@ -1,0 +1,63 @@
+//! 8-bit sRGB pictures.
+
+use std::io;
+
+use super::Picture;
+
+/// Encodes `picture` times 2^`exposure` as an sRGB PNG; values are cut to [0, 1], and what is no number is magenta.
+pub fn encode(picture: &Picture, exposure: f64) -> io::Result<Vec<u8>> {
+    let gain = libm::exp2(exposure);
+    let texels: Vec<u8> = picture.pixels.iter().flat_map(|&p| srgb8(p, gain)).collect();
+    encode_rgb8(picture.width, picture.height(), &texels)
+}
+
+/// Encodes sRGB bytes, rows from the top.
+pub fn encode_rgb8(width: u32, height: u32, rgb: &[u8]) -> io::Result<Vec<u8>> {
+    let mut bytes = Vec::new();
+    let mut encoder = png::Encoder::new(&mut bytes, width, height);
+    encoder.set_color(png::ColorType::Rgb);
+    encoder.set_depth(png::BitDepth::Eight);
+    encoder.set_source_srgb(png::SrgbRenderingIntent::RelativeColorimetric);
+    let mut writer = encoder.write_header().map_err(io::Error::other)?;
+    writer.write_image_data(rgb).map_err(io::Error::other)?;
+    writer.finish().map_err(io::Error::other)?;
+    Ok(bytes)
+}
+
+fn srgb8(pixel: [f32; 3], gain: f64) -> [u8; 3] {
+    if pixel.iter().any(|v| v.is_nan()) {
+        return [255, 0, 255];
+    }
+    pixel.map(|v| (encode_srgb(f64::from(v) * gain) * 255.0 + 0.5) as u8)
+}
+
+/// The transfer function of IEC 61966-2-1 for a linear value, cut to [0, 1].
+pub fn encode_srgb(linear: f64) -> f64 {
+    let v = linear.clamp(0.0, 1.0);
+    if v <= 0.003_130_8 { 12.92 * v } else { 1.055 * libm::pow(v, 1.0 / 2.4) - 0.055 }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn texels_are_srgb_with_exposure_and_in_order() {
+        // every 8-bit value decodes to a linear value that encodes to itself
+        for byte in 0..=255u8 {
+            let v = f64::from(byte) / 255.0;
+            let linear = if v <= 0.04045 { v / 12.92 } else { ((v + 0.055) / 1.055).powf(2.4) };
+            assert_eq!(srgb8([linear as f32; 3], 1.0), [byte; 3]);
+            assert_eq!(srgb8([linear as f32 * 4.0; 3], 0.25), [byte; 3]);
+        }
+        assert_eq!(srgb8([-1.0, 2.0, f32::INFINITY], 1.0), [0, 255, 255]);
+        assert_eq!(srgb8([0.0, f32::NAN, 0.0], 1.0), [255, 0, 255]);
+
+        let picture = Picture { width: 2, pixels: vec![[1.0, 0.0, 0.0], [0.0; 3], [0.0; 3], [0.0, 0.0, 0.5]] };
+        let bytes = encode(&picture, 1.0).unwrap();
+        let mut reader = png::Decoder::new(io::Cursor::new(&bytes)).read_info().unwrap();
+        let mut texels = vec![0; reader.output_buffer_size().unwrap()];
+        reader.next_frame(&mut texels).unwrap();
+        assert_eq!(texels, [255, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 255]);
+    }
+}

@@ -1,0 +1,118 @@
+//! Replacing a file whole: readers see the old one or the new one, and a failure leaves the old one.
+
+use std::fs::{self, File, OpenOptions};
+use std::io::{self, Write};
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context, anyhow};
+
+use crate::fault::Mistake;
+
+/// Whether `path` can be replaced, found out before any work is done: a file is made beside it and removed again.
+#[cfg_attr(not(test), expect(dead_code, reason = "rendering, which comes with herd's job, is its only user"))]
+pub fn probe(path: &Path) -> anyhow::Result<()> {
+    if path.is_dir() {
+        return Err(Mistake(format!("cannot write {}: it is a folder; name a file", path.display())).into());
+    }
+    let temporary = beside(path);
+    let made = create(&temporary).and_then(|_| fs::remove_file(&temporary));
+    made.map_err(|e| Mistake(format!("cannot write {}: {e}; choose another place with -o", path.display())).into())
+}
+
+/// Replaces `path` by `bytes`, on the disk when it returns.
+pub fn replace(path: &Path, bytes: &[u8]) -> io::Result<()> {
+    let temporary = beside(path);
+    let written = create(&temporary)
+        .and_then(|mut file| file.write_all(bytes).and_then(|()| file.sync_all()))
+        .and_then(|()| fs::rename(&temporary, path));
+    if written.is_err() {
+        // the first error is the one that matters; the file may not even exist
+        let _ = fs::remove_file(&temporary);
+    }
+    written
+}
+
+/// Replaces `path` by `bytes`, or else writes them to the first place that takes them: the working folder, then the
+/// system's folder for temporary files. An error always says where the bytes are, if anywhere.
+#[expect(dead_code, reason = "rendering, which comes with herd's job, is its only user")]
+pub fn replace_or_keep(path: &Path, bytes: &[u8]) -> anyhow::Result<()> {
+    replace_or_keep_in(path, bytes, &[PathBuf::from("."), std::env::temp_dir()])
+}
+
+fn replace_or_keep_in(path: &Path, bytes: &[u8], fallbacks: &[PathBuf]) -> anyhow::Result<()> {
+    let Err(error) = replace(path, bytes) else { return Ok(()) };
+    let name = path.file_name().context("an output without a name")?;
+    let kept = fallbacks.iter().find_map(|folder| {
+        let mut kept = folder.join(name).into_os_string();
+        kept.push(format!(".{}", std::process::id()));
+        replace(Path::new(&kept), bytes).is_ok().then(|| PathBuf::from(kept))
+    });
+    Err(match kept {
+        Some(kept) => anyhow!("cannot write {}: {error}; it was written to {} instead", path.display(), kept.display()),
+        None => anyhow!(
+            "cannot write {}: {error}; there was no room for it in {} either: free some and render again",
+            path.display(),
+            fallbacks.iter().map(|f| f.display().to_string()).collect::<Vec<_>>().join(" or ")
+        ),
+    })
+}
+
+/// The file that becomes `path`: in the same folder, so that renaming is atomic, and hidden while it is half done.
+fn beside(path: &Path) -> PathBuf {
+    let name = path.file_name().unwrap_or_default().to_string_lossy();
+    path.with_file_name(format!(".{name}.{}.tmp", std::process::id()))
+}
+
+fn create(path: &Path) -> io::Result<File> {
+    // one left by a process of the same number that was killed may be there
+    match fs::remove_file(path) {
+        Err(e) if e.kind() != io::ErrorKind::NotFound => return Err(e),
+        _ => {}
+    }
+    OpenOptions::new().write(true).create_new(true).open(path)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn names(folder: &Path) -> Vec<String> {
+        let mut names: Vec<String> =
+            fs::read_dir(folder).unwrap().map(|e| e.unwrap().file_name().into_string().unwrap()).collect();
+        names.sort();
+        names
+    }
+
+    #[test]
+    fn a_file_is_replaced_whole_and_nothing_else_is_left() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("a.exr");
+        probe(&path).unwrap();
+        assert_eq!(names(folder.path()), [""; 0]);
+        replace(&path, b"one").unwrap();
+        replace(&path, b"two").unwrap();
+        assert_eq!(fs::read(&path).unwrap(), b"two");
+        assert_eq!(names(folder.path()), ["a.exr"]);
+    }
+
+    #[test]
+    fn what_cannot_be_written_is_found_before_and_kept_after() {
+        let folder = tempfile::tempdir().unwrap();
+        let missing = folder.path().join("none/a.exr");
+        assert!(probe(&missing).unwrap_err().to_string().contains("cannot write"));
+        assert!(probe(folder.path()).unwrap_err().to_string().contains("it is a folder"));
+
+        let fallback = folder.path().to_path_buf();
+        let error = replace_or_keep_in(&missing, b"film", &[missing.clone(), fallback]).unwrap_err().to_string();
+        let kept = names(folder.path()).into_iter().find(|n| n.starts_with("a.exr.")).unwrap();
+        assert!(error.contains(&kept), "{error}");
+        assert_eq!(fs::read(folder.path().join(kept)).unwrap(), b"film");
+
+        let error = replace_or_keep_in(&missing, b"film", std::slice::from_ref(&missing)).unwrap_err().to_string();
+        assert!(error.contains("no room"), "{error}");
+        // a failed rename leaves no temporary file
+        fs::create_dir(folder.path().join("taken")).unwrap();
+        assert!(replace(&folder.path().join("taken"), b"film").is_err());
+        assert!(names(folder.path()).iter().all(|n| !n.ends_with(".tmp")));
+    }
+}

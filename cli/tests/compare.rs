@@ -1,0 +1,86 @@
+//! `rayherd compare` from outside.
+
+mod common;
+
+use std::fs;
+use std::path::Path;
+
+use common::{assert_mistake, rayherd};
+use serde_json::Value;
+
+fn write(path: &Path, size: (usize, usize), value: impl Fn(usize, usize) -> (f32, f32, f32) + Sync) {
+    exr::prelude::write_rgb_file(path, size.0, size.1, value).unwrap();
+}
+
+fn gradient(x: usize, y: usize) -> (f32, f32, f32) {
+    (x as f32 / 8.0, y as f32 / 4.0, 0.5)
+}
+
+#[test]
+fn pixels_files_and_differences() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = |name: &str| folder.path().join(name);
+    write(&at("a.exr"), (8, 4), gradient);
+    fs::copy(at("a.exr"), at("copy.exr")).unwrap();
+    write(&at("b.exr"), (8, 4), |x, y| {
+        let (r, g, b) = gradient(x, y);
+        (r, g, if (x, y) == (7, 3) { 1.0 } else { b })
+    });
+    let json = |run: &common::Run| serde_json::from_str::<Value>(&run.out).unwrap();
+
+    let same = rayherd(folder.path(), &["compare", "a.exr", "copy.exr"]);
+    assert_eq!(same.code, 0, "{}", same.err);
+    let report = json(&same);
+    assert_eq!(report["identical"], true);
+    assert_eq!(report["file_identical"], true);
+    assert_eq!(report["rmse"], 0.0);
+
+    let other = rayherd(folder.path(), &["compare", "a.exr", "b.exr", "--diff", "d.png"]);
+    assert_eq!(other.code, 1, "{}", other.err);
+    let report = json(&other);
+    assert_eq!(report["identical"], false);
+    assert_eq!(report["max_abs_diff"], 0.5);
+    assert_eq!(report["rmse"], (0.25f64 / 96.0).sqrt());
+    assert_eq!(report["relmse"], 0.25 / 1.01 / 96.0);
+    assert_eq!(report["mean_ratio"]["R"], 1.0);
+    assert_eq!(report["mean_ratio"]["B"], 16.0 / 16.5);
+    assert_eq!(report["channels"]["G"]["max_abs_diff"], 0.0);
+
+    // the difference is one pixel, in blue
+    let mut reader =
+        png::Decoder::new(std::io::BufReader::new(fs::File::open(at("d.png")).unwrap())).read_info().unwrap();
+    let mut texels = vec![0; reader.output_buffer_size().unwrap()];
+    reader.next_frame(&mut texels).unwrap();
+    assert_eq!(texels.len(), 8 * 4 * 3);
+    assert!(texels[..texels.len() - 1].iter().all(|&t| t == 0));
+    assert!(texels[texels.len() - 1] > 100);
+
+    for (tolerance, code) in [
+        (["--max-abs-diff", "0.5"], 0),
+        (["--max-abs-diff", "0.49"], 1),
+        (["--max-relmse", "0.01"], 0),
+        (["--max-mean-error", "0.01"], 1),
+    ] {
+        let run = rayherd(folder.path(), &["compare", "a.exr", "b.exr", tolerance[0], tolerance[1]]);
+        assert_eq!(run.code, code, "{tolerance:?}");
+    }
+}
+
+#[test]
+fn what_cannot_be_compared() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = |name: &str| folder.path().join(name);
+    write(&at("a.exr"), (8, 4), gradient);
+    write(&at("wide.exr"), (9, 4), gradient);
+    exr::prelude::write_rgba_file(at("alpha.exr"), 8, 4, |_, _| (0f32, 0f32, 0f32, 1f32)).unwrap();
+    fs::write(at("empty.exr"), "").unwrap();
+    fs::write(at("text.exr"), "this is no picture").unwrap();
+    let compare = |b: &str| rayherd(folder.path(), &["compare", "a.exr", b]);
+    assert_mistake(&compare("none.exr"), &["cannot read none.exr"]);
+    assert_mistake(&compare("empty.exr"), &["empty.exr: is no EXR file"]);
+    assert_mistake(&compare("text.exr"), &["text.exr: is no EXR file"]);
+    assert_mistake(&compare("wide.exr"), &["a.exr is 8x4 but wide.exr is 9x4"]);
+    assert_mistake(&compare("alpha.exr"), &["channels B, G, R", "A, B, G, R"]);
+    assert_mistake(&rayherd(folder.path(), &["compare", "a.exr", "a.exr", "--max-rmse", "-1"]), &["--max-rmse"]);
+    assert_mistake(&rayherd(folder.path(), &["compare", "a.exr", "a.exr", "--diff", "no/d.png"]), &["no/d.png"]);
+}

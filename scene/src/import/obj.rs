@@ -1,0 +1,229 @@
+//! Wavefront OBJ: `v`, `vt`, `vn` and `f`, with negative (relative) indices and continued lines; polygons are fanned from
+//! their first corner. Groups, materials, lines, points and free-form surfaces are passed over.
+
+use std::path::Path;
+
+use super::mesh::{Corners, Positions, TriangleReader, budget};
+use super::source::{Source, number, show};
+use super::spill::{Budget, Column};
+use super::stream::StreamOptions;
+use crate::ImportError;
+
+/// Longest line with its continuations.
+const MAX_LINE: usize = 1 << 20;
+
+/// An OBJ file being read.
+pub(super) struct ObjReader {
+    source: Source,
+    budget: Budget,
+    positions: Positions,
+    uv: Column<[f32; 2]>,
+    normals: Column<[f32; 3]>,
+    /// `v`, `vt` and `vn` passed in this reading; arrays are filled in the first.
+    seen: [usize; 3],
+    /// Corners of the polygon being fanned, and the triangles made of it.
+    polygon: Vec<[Option<usize>; 3]>,
+    fanned: usize,
+    line: Vec<u8>,
+    /// Whether anything was read that an OBJ file has.
+    recognized: bool,
+}
+
+impl ObjReader {
+    /// Opens a file.
+    pub fn open(path: &Path, options: &StreamOptions) -> Result<Self, ImportError> {
+        Ok(ObjReader {
+            source: Source::open(path)?,
+            budget: budget(options),
+            positions: Positions::Double(Column::new()),
+            uv: Column::new(),
+            normals: Column::new(),
+            seen: [0; 3],
+            polygon: vec![],
+            fanned: 0,
+            line: vec![],
+            recognized: false,
+        })
+    }
+
+    /// Reads a line with its continuations into `self.line`; false at the end.
+    fn read_line(&mut self) -> Result<bool, ImportError> {
+        self.line.clear();
+        loop {
+            let Some(part) = self.source.line_bytes()? else { return Ok(!self.line.is_empty()) };
+            let Some(part) = part.strip_suffix(b"\\") else {
+                self.line.extend_from_slice(part);
+                return Ok(true);
+            };
+            self.line.extend_from_slice(part);
+            self.line.push(b' ');
+            if self.line.len() > MAX_LINE {
+                return self.source.fail_line(format!("a line longer than {MAX_LINE} bytes with its continuations"));
+            }
+        }
+    }
+
+    /// Reads on to the next polygon; false at the end.
+    fn next_polygon(&mut self) -> Result<bool, ImportError> {
+        while self.read_line()? {
+            let line = std::mem::take(&mut self.line);
+            let mut words = line.split(|b| b.is_ascii_whitespace()).filter(|w| !w.is_empty());
+            let keyword = words.next().unwrap_or(b"");
+            let is_face = keyword == b"f";
+            match keyword {
+                b"v" => self.vertex(words)?,
+                b"vt" => self.texture_coordinate(words)?,
+                b"vn" => self.normal(words)?,
+                b"f" => self.face(words)?,
+                _ => {}
+            }
+            self.line = line;
+            if is_face {
+                self.recognized = true;
+                if self.polygon.len() >= 3 {
+                    self.fanned = 0;
+                    return Ok(true);
+                }
+            }
+        }
+        if !self.recognized && self.seen[0] == 0 {
+            return self.source.fail_line("no vertex and no face in this file: it is no OBJ file, or it is empty");
+        }
+        Ok(false)
+    }
+
+    fn vertex<'w>(&mut self, words: impl Iterator<Item = &'w [u8]>) -> Result<(), ImportError> {
+        self.seen[0] += 1;
+        if self.seen[0] <= self.positions.len() {
+            return Ok(());
+        }
+        let p = self.numbers::<f64, 3>(words, "v", 3)?;
+        match &mut self.positions {
+            Positions::Double(column) => column.push(p, &mut self.budget).map_err(|e| self.source.io(e)),
+            Positions::Single(_) => unreachable!("made as double"),
+        }
+    }
+
+    fn texture_coordinate<'w>(&mut self, words: impl Iterator<Item = &'w [u8]>) -> Result<(), ImportError> {
+        self.seen[1] += 1;
+        if self.seen[1] <= self.uv.len() {
+            return Ok(());
+        }
+        let uv = self.numbers::<f32, 2>(words, "vt", 1)?;
+        self.uv.push(uv, &mut self.budget).map_err(|e| self.source.io(e))
+    }
+
+    fn normal<'w>(&mut self, words: impl Iterator<Item = &'w [u8]>) -> Result<(), ImportError> {
+        self.seen[2] += 1;
+        if self.seen[2] <= self.normals.len() {
+            return Ok(());
+        }
+        let n = self.numbers::<f32, 3>(words, "vn", 3)?;
+        self.normals.push(n, &mut self.budget).map_err(|e| self.source.io(e))
+    }
+
+    /// The first `N` numbers of a line, of which `least` must be there (others are 0).
+    fn numbers<'w, T: std::str::FromStr + Default + Copy, const N: usize>(
+        &self,
+        mut words: impl Iterator<Item = &'w [u8]>,
+        keyword: &str,
+        least: usize,
+    ) -> Result<[T; N], ImportError> {
+        let mut out = [T::default(); N];
+        for (i, slot) in out.iter_mut().enumerate() {
+            match words.next() {
+                Some(word) => match number(word) {
+                    Some(value) => *slot = value,
+                    None => {
+                        return self
+                            .source
+                            .fail_line(format!("\"{}\" where a number of {keyword} should be", show(word)));
+                    }
+                },
+                None if i < least => return self.source.fail_line(format!("{keyword} needs {least} number(s)")),
+                None => break,
+            }
+        }
+        Ok(out)
+    }
+
+    /// Fills `self.polygon`.
+    fn face<'w>(&mut self, words: impl Iterator<Item = &'w [u8]>) -> Result<(), ImportError> {
+        self.polygon.clear();
+        for word in words {
+            if word[0] == b'#' {
+                break;
+            }
+            let mut corner = [None; 3];
+            let mut parts = word.split(|b| *b == b'/');
+            for (k, slot) in corner.iter_mut().enumerate() {
+                if let Some(part) = parts.next().filter(|p| !p.is_empty()) {
+                    *slot = Some(self.index(part, k, word)?);
+                }
+            }
+            if corner[0].is_none() || parts.next().is_some() {
+                return self
+                    .source
+                    .fail_line(format!("\"{}\" is no corner of the form v, v/vt, v//vn or v/vt/vn", show(word)));
+            }
+            self.polygon.push(corner);
+        }
+        Ok(())
+    }
+
+    /// A number from 1, or from -1 backwards, as a place in the array of `v`, `vt` or `vn`.
+    fn index(&self, part: &[u8], kind: usize, word: &[u8]) -> Result<usize, ImportError> {
+        let Some(value) = number::<i64>(part) else {
+            return self.source.fail_line(format!("\"{}\" where a corner of a face should be", show(word)));
+        };
+        let seen = self.seen[kind] as i64;
+        let index = if value < 0 { seen.checked_add(value) } else { value.checked_sub(1) };
+        match index {
+            Some(i) if (0..seen).contains(&i) => Ok(i as usize),
+            _ => {
+                let name = ["v", "vt", "vn"][kind];
+                self.source.fail_line(format!("index {value} of {name}, but {seen} of them stand above"))
+            }
+        }
+    }
+}
+
+impl TriangleReader for ObjReader {
+    fn next(&mut self) -> Result<Option<Corners>, ImportError> {
+        if self.fanned + 2 >= self.polygon.len() && !self.next_polygon()? {
+            return Ok(None);
+        }
+        let corners = [0, self.fanned + 1, self.fanned + 2].map(|i| self.polygon[i]);
+        self.fanned += 1;
+        // every index was compared with the numbers of its kind
+        let vertices = corners.map(|c| c[0].unwrap_or(0));
+        let all = |k: usize| {
+            let [a, b, c] = corners.map(|c| c[k]);
+            Some([a?, b?, c?])
+        };
+        Ok(Some(Corners {
+            p: vertices.map(|i| self.positions.get(i).unwrap_or([f64::NAN; 3])),
+            n: all(2).map(|n| n.map(|i| self.normals.get(i).unwrap_or_default())),
+            uv: all(1).map(|uv| uv.map(|i| self.uv.get(i).unwrap_or_default())),
+            vertices,
+        }))
+    }
+
+    fn rewind(&mut self) -> Result<(), ImportError> {
+        self.seen = [0; 3];
+        self.polygon.clear();
+        self.fanned = 0;
+        self.source.seek(0, 0)
+    }
+
+    fn source(&self) -> &Source {
+        &self.source
+    }
+
+    fn budget(&mut self) -> &mut Budget {
+        &mut self.budget
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,77 @@
+use crate::description::MeshFormat;
+use crate::import::tests::{folder, mesh_shape, records, triangles, write};
+use crate::record::Record;
+
+#[test]
+fn corners_of_all_forms() {
+    let dir = folder();
+    let text = "# a comment\nmtllib x.mtl\no thing\nv 0 0 0\nv 1 0 0 1.0\nv 1 1 0 0.5 0.5 0.5\r\nv 0 1 0\nvt 0.25\nvt 0.5 0.75 0\n\
+                vn 0 0 2\nusemtl red\nf 1 2 3 4\nf -4 -3 -2\ns 1\nf 1/1 2/2 3/1\nf 1//1 2//-1 3//1\nf 1/2/1 \\\n 2/2/1 3/2/1 # end\n\
+                l 1 2\nf 1 2\np 1\n";
+    let t = triangles(&write(&dir, "a.obj", text), MeshFormat::Obj).unwrap();
+    assert_eq!(t.len(), 2 + 1 + 1 + 1 + 1);
+    assert_eq!(t[0].p, [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 1.0, 0.0]]);
+    assert_eq!(t[1].p, [[0.0, 0.0, 0.0], [1.0, 1.0, 0.0], [0.0, 1.0, 0.0]]);
+    assert_eq!(t[2].p, t[0].p);
+    assert_eq!(t[3].uv, Some([[0.25, 0.0], [0.5, 0.75], [0.25, 0.0]]));
+    assert_eq!(t[4].n, Some([[0.0, 0.0, 1.0]; 3]), "unit length");
+    assert_eq!((t[5].n, t[5].uv), (Some([[0.0, 0.0, 1.0]; 3]), Some([[0.5, 0.75]; 3])));
+}
+
+#[test]
+fn smoothing_reads_twice_and_changes_only_normals() {
+    let dir = folder();
+    let path = write(&dir, "a.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf -3 -2 -1\nv 1 1 0\nf 2 -1 3\n");
+    let flat = records(&mesh_shape(&path, MeshFormat::Obj, false)).unwrap();
+    let smooth = records(&mesh_shape(&path, MeshFormat::Obj, true)).unwrap();
+    for (a, b) in flat.iter().zip(&smooth) {
+        let (Record::Triangle(a), Record::Triangle(b)) = (a, b) else { panic!() };
+        assert_eq!((a.p, a.n, b.n), (b.p, None, Some([[0.0, 0.0, 1.0]; 3])));
+    }
+    assert_eq!(flat.len(), smooth.len());
+    // a file with normals keeps them
+    let path = write(&dir, "b.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nvn 1 0 0\nf 1 2 3\nf 1//1 2//1 3//1\n");
+    let all = records(&mesh_shape(&path, MeshFormat::Obj, true)).unwrap();
+    let normals: Vec<_> = all.iter().map(|r| if let Record::Triangle(t) = r { t.n } else { None }).collect();
+    assert_eq!(normals, [None, Some([[1.0, 0.0, 0.0]; 3])]);
+}
+
+#[test]
+fn errors_name_the_line() {
+    let dir = folder();
+    let head = "v 0 0 0\nv 1 0 0\nv 0 1 0\n";
+    for (line, what) in [
+        ("f 1 2 4", "a.obj:4: index 4 of v, but 3"),
+        ("f 1 2 0", "index 0"),
+        ("f 1 2 -4", "index -4"),
+        ("f 1 2 9223372036854775807", "index 9223372036854775807"),
+        ("f 1 2 -9223372036854775808", "index -9223372036854775808"),
+        ("f 1 2 3/1", "index 1 of vt, but 0"),
+        ("f 1 2 3//1", "index 1 of vn, but 0"),
+        ("f 1 2 3/1/1/1", "index 1 of vt"),
+        ("f a b c", "\"a\" where a corner"),
+        ("f /1 2 3", "index 1 of vt"),
+        ("f / 2 3", "no corner of the form"),
+        ("v 1 2", "v needs 3"),
+        ("v 1 2 x", "\"x\" where a number of v"),
+    ] {
+        let error =
+            triangles(&write(&dir, "a.obj", format!("{head}{line}\n")), MeshFormat::Obj).unwrap_err().to_string();
+        assert!(error.contains(what), "{line}: {error}");
+    }
+    for text in ["", "garbage in here\n"] {
+        let error = triangles(&write(&dir, "a.obj", text), MeshFormat::Obj).unwrap_err().to_string();
+        assert!(error.contains("no OBJ file"), "{error}");
+    }
+    let error = triangles(&write(&dir, "a.obj", format!("v {}", "1".repeat(1 << 19))), MeshFormat::Obj).unwrap_err();
+    assert!(error.to_string().contains("line longer"));
+    let error = triangles(&write(&dir, "a.obj", "v \\\n".repeat(1 << 19)), MeshFormat::Obj).unwrap_err();
+    assert!(error.to_string().contains("continuations"));
+}
+
+#[test]
+fn numbers_that_are_not_finite_pass() {
+    let dir = folder();
+    let t = triangles(&write(&dir, "a.obj", "v nan 0 0\nv inf 0 0\nv 1e999 1 0\nf 1 2 3\n"), MeshFormat::Obj).unwrap();
+    assert!(t[0].p[0][0].is_nan() && t[0].p[1][0] == f64::INFINITY && t[0].p[2][0] == f64::INFINITY);
+}

@@ -1,0 +1,335 @@
+//! Stanford PLY: ascii, little and big endian, any properties in any order; polygons are fanned from their first corner.
+//!
+//! Read are `x y z`, `nx ny nz`, `u v` (or `s t`, `texture_u texture_v`, `texture_s texture_t`) of `vertex`, and `vertex_indices`
+//! (or `vertex_index`) of `face`; everything else is passed over.
+
+mod header;
+
+use std::path::Path;
+
+use self::header::{Element, Format, Header, Kind, Property};
+use super::mesh::{Corners, Positions, TriangleReader, budget};
+use super::source::{Source, number, show};
+use super::spill::{Budget, Column};
+use super::stream::StreamOptions;
+use crate::ImportError;
+
+/// A PLY file whose vertices are read, at its faces.
+pub(super) struct PlyReader {
+    source: Source,
+    format: Format,
+    budget: Budget,
+    positions: Positions,
+    normals: Option<Column<[f32; 3]>>,
+    uv: Option<Column<[f32; 2]>>,
+    faces: Element,
+    /// Which property of a face lists its vertices.
+    list: usize,
+    /// Byte and line of the first face.
+    first: (u64, u32),
+    /// Faces that have not begun.
+    left: u64,
+    fan: Fan,
+}
+
+/// What is left of a polygon.
+#[derive(Default)]
+struct Fan {
+    first: usize,
+    previous: usize,
+    left: u64,
+}
+
+impl PlyReader {
+    /// Reads header and vertices.
+    pub fn open(path: &Path, options: &StreamOptions) -> Result<Self, ImportError> {
+        let mut source = Source::open(path)?;
+        let header = Header::read(&mut source)?;
+        header.check_counts(&source)?;
+        let mut vertices = None;
+        for element in header.elements {
+            match element.name.as_str() {
+                "vertex" if vertices.is_none() => {
+                    let mut budget = budget(options);
+                    let columns = read_vertices(&mut source, header.format, &element, &mut budget)?;
+                    vertices = Some((columns, budget));
+                }
+                "face" => {
+                    let Some(((positions, normals, uv), budget)) = vertices else {
+                        return source.fail_line("the faces stand before the vertices: write element vertex first");
+                    };
+                    let list = element.properties.iter().position(|p| match p {
+                        Property::List { name, .. } => name == "vertex_indices" || name == "vertex_index",
+                        Property::Scalar { .. } => false,
+                    });
+                    let Some(list) = list else {
+                        return source.fail_line("element face has no list property vertex_indices");
+                    };
+                    if let Property::List { kind, .. } = element.properties[list]
+                        && kind.is_float()
+                    {
+                        return source.fail_line("vertex_indices are floating point numbers: use int or uint");
+                    }
+                    let first = (source.offset(), source.line());
+                    let left = element.count;
+                    let (format, faces, fan) = (header.format, element, Fan::default());
+                    return Ok(PlyReader {
+                        source,
+                        format,
+                        budget,
+                        positions,
+                        normals,
+                        uv,
+                        faces,
+                        list,
+                        first,
+                        left,
+                        fan,
+                    });
+                }
+                _ => {
+                    for _ in 0..if element.properties.is_empty() { 0 } else { element.count } {
+                        for property in &element.properties {
+                            skip(&mut source, header.format, property)?;
+                        }
+                    }
+                }
+            }
+        }
+        source.fail_line("no element face: a point cloud or strips cannot be rendered, write triangles or polygons")
+    }
+
+    fn index(&mut self, kind: Kind) -> Result<usize, ImportError> {
+        let value = integer(&mut self.source, self.format, kind)?;
+        match usize::try_from(value) {
+            Ok(i) if i < self.positions.len() => Ok(i),
+            _ => self.fail(format!("vertex index {value}, but the file has {} vertices", self.positions.len())),
+        }
+    }
+
+    fn fail<T>(&self, message: String) -> Result<T, ImportError> {
+        let face = self.faces.count - self.left - 1;
+        let message = format!("face {face}: {message}");
+        match self.format {
+            Format::Ascii => self.source.fail_line(message),
+            _ => self.source.fail_byte(message),
+        }
+    }
+
+    /// Begins the next face with at least three corners, or says that there is none.
+    fn begin(&mut self, count: Kind, kind: Kind) -> Result<bool, ImportError> {
+        while self.left > 0 {
+            self.left -= 1;
+            for property in &self.faces.properties[..self.list] {
+                skip(&mut self.source, self.format, property)?;
+            }
+            let n = integer(&mut self.source, self.format, count)?;
+            let Ok(n) = u64::try_from(n) else { return self.fail(format!("{n} corners")) };
+            if n > self.source.most_left() {
+                return self.fail(format!("{n} corners, which is more than the rest of the file holds"));
+            }
+            if n >= 3 {
+                let (first, previous) = (self.index(kind)?, self.index(kind)?);
+                self.fan = Fan { first, previous, left: n - 2 };
+                return Ok(true);
+            }
+            // no area
+            for _ in 0..n {
+                self.index(kind)?;
+            }
+            self.end()?;
+        }
+        Ok(false)
+    }
+
+    /// Passes what a face has after its list.
+    fn end(&mut self) -> Result<(), ImportError> {
+        for property in &self.faces.properties[self.list + 1..] {
+            skip(&mut self.source, self.format, property)?;
+        }
+        Ok(())
+    }
+}
+
+impl TriangleReader for PlyReader {
+    fn next(&mut self) -> Result<Option<Corners>, ImportError> {
+        let Property::List { count, kind, .. } = self.faces.properties[self.list] else {
+            unreachable!("chosen as a list when the file was opened")
+        };
+        if self.fan.left == 0 && !self.begin(count, kind)? {
+            return Ok(None);
+        }
+        let vertices = [self.fan.first, self.fan.previous, self.index(kind)?];
+        self.fan.previous = vertices[2];
+        self.fan.left -= 1;
+        if self.fan.left == 0 {
+            self.end()?;
+        }
+        // every index was compared with the number of vertices
+        let corner = |i| self.positions.get(i).unwrap_or([f64::NAN; 3]);
+        let gather3 = |c: &Column<[f32; 3]>| vertices.map(|i| c.get(i).unwrap_or_default());
+        let gather2 = |c: &Column<[f32; 2]>| vertices.map(|i| c.get(i).unwrap_or_default());
+        Ok(Some(Corners {
+            p: vertices.map(corner),
+            n: self.normals.as_ref().map(gather3),
+            uv: self.uv.as_ref().map(gather2),
+            vertices,
+        }))
+    }
+
+    fn rewind(&mut self) -> Result<(), ImportError> {
+        self.left = self.faces.count;
+        self.fan = Fan::default();
+        self.source.seek(self.first.0, self.first.1)
+    }
+
+    fn source(&self) -> &Source {
+        &self.source
+    }
+
+    fn budget(&mut self) -> &mut Budget {
+        &mut self.budget
+    }
+}
+
+type Columns = (Positions, Option<Column<[f32; 3]>>, Option<Column<[f32; 2]>>);
+
+/// Slots of what is wanted of a vertex: position, normal, uv.
+const SLOTS: [&[&str]; 8] = [
+    &["x"],
+    &["y"],
+    &["z"],
+    &["nx"],
+    &["ny"],
+    &["nz"],
+    &["u", "s", "texture_u", "texture_s"],
+    &["v", "t", "texture_v", "texture_t"],
+];
+
+fn read_vertices(
+    source: &mut Source,
+    format: Format,
+    element: &Element,
+    budget: &mut Budget,
+) -> Result<Columns, ImportError> {
+    let slot_of = |property: &Property| match property {
+        Property::Scalar { name, .. } => SLOTS.iter().position(|names| names.contains(&name.as_str())),
+        Property::List { .. } => None,
+    };
+    let slots: Vec<Option<usize>> = element.properties.iter().map(slot_of).collect();
+    let has = |wanted: std::ops::Range<usize>| wanted.clone().all(|s| slots.contains(&Some(s)));
+    if !has(0..3) {
+        return source.fail_line("element vertex lacks one of the properties x, y and z");
+    }
+    let double = element.properties.iter().zip(&slots).any(|(property, slot)| match property {
+        Property::Scalar { kind, .. } => slot.is_some_and(|s| s < 3) && !kind.fits_f32(),
+        Property::List { .. } => false,
+    });
+    let mut positions = if double { Positions::Double(Column::new()) } else { Positions::Single(Column::new()) };
+    let mut normals = has(3..6).then(Column::new);
+    let mut uv = has(6..8).then(Column::new);
+
+    // in a binary file a vertex without lists is so many bytes, with each property at its place
+    let mut stride = Some(0);
+    let mut fields = vec![];
+    for (property, slot) in element.properties.iter().zip(&slots) {
+        match (property, stride) {
+            (Property::Scalar { kind, .. }, Some(at)) => {
+                fields.extend(slot.map(|slot| (slot, at, *kind)));
+                stride = Some(at + kind.size());
+            }
+            _ => stride = None,
+        }
+    }
+
+    for _ in 0..element.count {
+        let mut values = [0.0f64; 8];
+        match (format, stride) {
+            (Format::LittleEndian | Format::BigEndian, Some(stride)) => {
+                let bytes = source.exact(stride)?;
+                for &(slot, at, kind) in &fields {
+                    values[slot] = kind.decode(format, &bytes[at..at + kind.size()]);
+                }
+            }
+            _ => {
+                for (property, slot) in element.properties.iter().zip(&slots) {
+                    match (property, slot) {
+                        (Property::Scalar { kind, .. }, Some(slot)) => values[*slot] = scalar(source, format, *kind)?,
+                        _ => skip(source, format, property)?,
+                    }
+                }
+            }
+        }
+        let [x, y, z, nx, ny, nz, u, v] = values;
+        let pushed = match &mut positions {
+            Positions::Single(column) => column.push([x as f32, y as f32, z as f32], budget),
+            Positions::Double(column) => column.push([x, y, z], budget),
+        }
+        .and_then(|()| normals.as_mut().map_or(Ok(()), |c| c.push([nx as f32, ny as f32, nz as f32], budget)))
+        .and_then(|()| uv.as_mut().map_or(Ok(()), |c| c.push([u as f32, v as f32], budget)));
+        pushed.map_err(|e| source.io(e))?;
+    }
+    Ok((positions, normals, uv))
+}
+
+/// One number.
+fn scalar(source: &mut Source, format: Format, kind: Kind) -> Result<f64, ImportError> {
+    if format != Format::Ascii {
+        return Ok(kind.decode(format, source.exact(kind.size())?));
+    }
+    let Some(token) = source.token()? else { return truncated(source) };
+    // a float is rounded once, as its binary form was
+    let value = if kind == Kind::F32 { number::<f32>(token).map(f64::from) } else { number::<f64>(token) };
+    match value {
+        Some(value) => Ok(value),
+        None => {
+            let word = show(token);
+            source.fail_line(format!("\"{word}\" where a number should be"))
+        }
+    }
+}
+
+/// One whole number.
+fn integer(source: &mut Source, format: Format, kind: Kind) -> Result<i64, ImportError> {
+    if format != Format::Ascii {
+        return Ok(kind.decode(format, source.exact(kind.size())?) as i64);
+    }
+    let Some(token) = source.token()? else { return truncated(source) };
+    match number::<i64>(token) {
+        Some(value) => Ok(value),
+        None => {
+            let word = show(token);
+            source.fail_line(format!("\"{word}\" where a whole number should be"))
+        }
+    }
+}
+
+fn truncated<T>(source: &Source) -> Result<T, ImportError> {
+    source.fail_line("the file ends in the middle of its data: it is truncated, get it again")
+}
+
+/// Passes a property that nobody asked for.
+fn skip(source: &mut Source, format: Format, property: &Property) -> Result<(), ImportError> {
+    match property {
+        Property::Scalar { kind, .. } => skip_values(source, format, *kind, 1),
+        Property::List { count, kind, .. } => match u64::try_from(integer(source, format, *count)?) {
+            Ok(n) => skip_values(source, format, *kind, n),
+            Err(_) => source.fail_byte("a list of negative length"),
+        },
+    }
+}
+
+fn skip_values(source: &mut Source, format: Format, kind: Kind, n: u64) -> Result<(), ImportError> {
+    if format != Format::Ascii {
+        return source.skip(n * kind.size() as u64);
+    }
+    for _ in 0..n {
+        if source.token()?.is_none() {
+            return truncated(source);
+        }
+    }
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,189 @@
+use crate::ImportError;
+use crate::description::MeshFormat;
+use crate::import::StreamOptions;
+use crate::import::tests::{folder, mesh_shape, records, records_with, triangles, write};
+use crate::record::{Record, TriangleRecord};
+
+/// A quad and a triangle, with extra elements and properties, in an odd order.
+const HEADER: &str = "comment by hand\nobj_info nothing\nelement camera 1\nproperty double where\nproperty list uchar short views\n\
+                      element vertex 5\nproperty uchar red\nproperty float nz\nproperty float x\nproperty float y\nproperty float z\n\
+                      property float nx\nproperty float ny\nproperty float s\nproperty float t\n\
+                      element face 3\nproperty short flags\nproperty list uchar uint vertex_index\nproperty float quality\n\
+                      element edge 1\nproperty int a\nproperty int b\nend_header\n";
+
+#[derive(Clone, Copy)]
+enum Cell {
+    U8(u8),
+    I16(i16),
+    I32(i32),
+    U32(u32),
+    F32(f32),
+    F64(f64),
+}
+use Cell::*;
+
+fn cells() -> Vec<Cell> {
+    let mut out = vec![F64(0.1), U8(2), I16(-1), I16(300)];
+    for i in 0..5 {
+        let f = i as f32;
+        out.extend([
+            U8(i),
+            F32(1.0),
+            F32(f * 0.1),
+            F32(-f * 1e-3),
+            F32(1.0 / 3.0),
+            F32(0.0),
+            F32(0.0),
+            F32(f),
+            F32(0.7),
+        ]);
+    }
+    out.extend([I16(7), U8(4), U32(0), U32(1), U32(2), U32(3), F32(0.5)]);
+    out.extend([I16(7), U8(2), U32(0), U32(1), F32(0.5)]); // an edge: no triangle
+    out.extend([I16(-7), U8(3), U32(4), U32(3), U32(0), F32(0.5)]);
+    out.extend([I32(0), I32(1)]);
+    out
+}
+
+fn ascii() -> Vec<u8> {
+    let mut out = format!("ply\nformat ascii 1.0\n{HEADER}");
+    for cell in cells() {
+        let word = match cell {
+            U8(v) => v.to_string(),
+            I16(v) => v.to_string(),
+            I32(v) => v.to_string(),
+            U32(v) => v.to_string(),
+            F32(v) => v.to_string(),
+            F64(v) => v.to_string(),
+        };
+        out += &word;
+        out += if out.len() % 3 == 0 { "\n" } else { " " };
+    }
+    out.into_bytes()
+}
+
+fn binary(little: bool) -> Vec<u8> {
+    let name = if little { "binary_little_endian" } else { "binary_big_endian" };
+    let mut out = format!("ply\r\nformat {name} 1.0\r\n{}", HEADER.replace('\n', "\r\n")).into_bytes();
+    for cell in cells() {
+        let mut bytes = match cell {
+            U8(v) => v.to_le_bytes().to_vec(),
+            I16(v) => v.to_le_bytes().to_vec(),
+            I32(v) => v.to_le_bytes().to_vec(),
+            U32(v) => v.to_le_bytes().to_vec(),
+            F32(v) => v.to_le_bytes().to_vec(),
+            F64(v) => v.to_le_bytes().to_vec(),
+        };
+        if !little {
+            bytes.reverse();
+        }
+        out.extend(bytes);
+    }
+    out
+}
+
+#[test]
+fn the_three_formats_are_the_same_mesh() {
+    let dir = folder();
+    let read = |name: &str, bytes: Vec<u8>| triangles(&write(&dir, name, bytes), MeshFormat::Ply).unwrap();
+    let a = read("a.ply", ascii());
+    assert_eq!(a.len(), 3);
+    assert_eq!(a[0].p[1], [f64::from(0.1f32), f64::from(-1e-3f32), f64::from(1.0f32 / 3.0)]);
+    assert_eq!(a[0].n, Some([[0.0, 0.0, 1.0]; 3]));
+    assert_eq!(a[1].uv, Some([[0.0, 0.7], [2.0, 0.7], [3.0, 0.7]]), "the fan's second triangle has corners 0, 2, 3");
+    assert_eq!(a[2].uv, Some([[4.0, 0.7], [3.0, 0.7], [0.0, 0.7]]));
+    assert_eq!(a, read("l.ply", binary(true)));
+    assert_eq!(a, read("b.ply", binary(false)));
+}
+
+#[test]
+fn steps_and_spilling_change_nothing() {
+    let dir = folder();
+    let n = 300;
+    let mut text = format!(
+        "ply\nformat ascii 1.0\nelement vertex {}\nproperty double x\nproperty double y\nproperty double z\nelement face {}\n\
+         property list int int vertex_indices\nend_header\n",
+        n * n,
+        (n - 1) * (n - 1)
+    );
+    for i in 0..n * n {
+        text += &format!("{} {} 0.25\n", i % n, i / n);
+    }
+    for i in (0..n * (n - 1)).filter(|i| i % n < n - 1) {
+        text += &format!("4 {} {} {} {}\n", i, i + 1, i + n + 1, i + n);
+    }
+    let description = mesh_shape(&write(&dir, "grid.ply", text), MeshFormat::Ply, false);
+    let all = records(&description).unwrap();
+    assert_eq!(all.len(), 2 * (n - 1) * (n - 1));
+    let small = StreamOptions { vertex_budget: 0, ..StreamOptions::default() };
+    assert_eq!(records_with(&description, small, 7).unwrap(), all);
+    let too_small = StreamOptions { vertex_budget: 0, spill_limit: 1000, ..StreamOptions::default() };
+    assert!(records_with(&description, too_small, 7).unwrap_err().to_string().contains("spill"));
+}
+
+#[test]
+fn smooth_normals_are_computed_where_there_are_none() {
+    // a roof: two right triangles at 90 degrees along the x axis
+    let dir = folder();
+    let text = "ply\nformat ascii 1.0\nelement vertex 4\nproperty float x\nproperty float y\nproperty float z\nelement face 2\n\
+                property list uchar int vertex_indices\nend_header\n0 0 0\n1 0 0\n0 1 0\n0 0 -1\n3 0 1 2\n3 1 0 3\n";
+    let path = write(&dir, "roof.ply", text);
+    let normals = |smooth| -> Vec<TriangleRecord> {
+        let all = records(&mesh_shape(&path, MeshFormat::Ply, smooth)).unwrap();
+        all.into_iter().map(|r| if let Record::Triangle(t) = r { t } else { unreachable!() }).collect()
+    };
+    assert!(normals(false).iter().all(|t| t.n.is_none()));
+    let all = normals(true);
+    let h = std::f32::consts::FRAC_1_SQRT_2;
+    let close = |a: [f32; 3], b: [f32; 3]| (0..3).all(|k| (a[k] - b[k]).abs() < 1e-6);
+    let n = all[0].n.unwrap();
+    // front of the first is +z, of the second -y; equal angles at both shared vertices
+    assert!(close(n[0], [0.0, -h, h]) && close(n[1], [0.0, -h, h]) && close(n[2], [0.0, 0.0, 1.0]), "{n:?}");
+    assert!(close(all[1].n.unwrap()[2], [0.0, -1.0, 0.0]));
+}
+
+#[test]
+fn errors_name_the_place() {
+    let dir = folder();
+    let small = "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n\
+                 element face 1\nproperty list uchar int vertex_indices\nend_header\n0 0 0\n1 0 0\n0 2 0\n3 0 1 2\n";
+    let cases: &[(&str, &str, &str)] = &[
+        ("3 0 1 2", "3 0 1 3", "a.ply:13: face 0: vertex index 3, but the file has 3 vertices"),
+        ("3 0 1 2", "3 0 1 -1", "vertex index -1"),
+        ("3 0 1 2", "3 0 1", "truncated"),
+        ("3 0 1 2", "250 0 1 2", "more than the rest"),
+        ("3 0 1 2", "-3 0 1 2", "-3 corners"),
+        ("3 0 1 2", "3 0 x 2", "a.ply:13: \"x\" where a whole number"),
+        ("1 0 0\n", "1 zero 0\n", "a.ply:11: \"zero\" where a number"),
+        ("vertex 3", "vertex 4000000000", "truncated"),
+        ("face 1", "face 18446744073709551615", "truncated"),
+        ("face 1", "face -1", "a.ply:7: \"-1\" is no number of elements"),
+        ("format ascii 1.0\n", "", "no line format"),
+        ("ascii", "ebcdic", "a.ply:2: unknown format"),
+        ("property float x\n", "", "lacks one of the properties"),
+        ("list uchar int", "list float int", "no property that PLY knows"),
+        ("list uchar int", "list uchar float", "floating point"),
+        ("vertex_indices", "corners", "no list property"),
+        ("element face 1\nproperty list uchar int vertex_indices\n", "", "no element face"),
+        ("end_header\n", "", "no header line that PLY knows"),
+        ("ply\n", "plywood\n", "no PLY file"),
+    ];
+    for (from, to, what) in cases {
+        let text = small.replacen(from, to, 1);
+        assert_ne!(text, small);
+        let error = triangles(&write(&dir, "a.ply", text), MeshFormat::Ply).unwrap_err().to_string();
+        assert!(error.contains(what), "{to}: {error}");
+    }
+    let whole = binary(true);
+    for cut in [10, 100, whole.len() - 20, whole.len() - 60] {
+        let path = write(&dir, "cut.ply", &whole[..cut]);
+        let error = triangles(&path, MeshFormat::Ply).unwrap_err();
+        assert!(matches!(error, ImportError::Malformed { .. } | ImportError::Limit { .. }), "{error}");
+    }
+    let huge = format!("ply\n{}", "comment and so on\n".repeat(100_000));
+    assert!(
+        triangles(&write(&dir, "h.ply", huge), MeshFormat::Ply).unwrap_err().to_string().contains("header is longer")
+    );
+    let long = format!("ply\n{}", "x".repeat(1 << 20));
+    assert!(triangles(&write(&dir, "h.ply", long), MeshFormat::Ply).unwrap_err().to_string().contains("line longer"));
+}

@@ -1,0 +1,317 @@
+//! A file being read once from front to back, in bounded memory; gzip is unpacked on the way.
+
+use std::fs::File;
+use std::io::{self, Read, Seek, SeekFrom};
+use std::path::{Path, PathBuf};
+
+use flate2::read::MultiGzDecoder;
+
+use crate::ImportError;
+use crate::description::Place;
+
+/// Bytes in memory; also the longest line.
+const BUFFER: usize = 256 << 10;
+/// Longest word of a text format.
+const MAX_TOKEN: usize = 256;
+/// DEFLATE never makes more than this many bytes of one (RFC 1951: a 258-byte match takes at least 2 bits).
+const MAX_EXPANSION: u64 = 1032;
+
+/// A file, its buffer, and where in it we are.
+pub(super) struct Source {
+    path: PathBuf,
+    input: Input,
+    buffer: Box<[u8]>,
+    start: usize,
+    end: usize,
+    /// Of `buffer[start]`, in unpacked bytes.
+    offset: u64,
+    /// Line of the last word or line read, from 1.
+    line: u32,
+    file_length: u64,
+    /// Read from files that were opened before this one (see [`Source::seek`]).
+    earlier: u64,
+}
+
+enum Input {
+    Plain(Counting),
+    Gzip(Box<MultiGzDecoder<Counting>>),
+}
+
+/// A file that counts what is read.
+struct Counting(File, u64);
+
+impl Read for Counting {
+    fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
+        let n = self.0.read(buffer)?;
+        self.1 += n as u64;
+        Ok(n)
+    }
+}
+
+impl Source {
+    /// Opens a regular file.
+    pub fn open(path: &Path) -> Result<Source, ImportError> {
+        let io = |source| ImportError::Io { path: path.into(), source };
+        let metadata = std::fs::metadata(path).map_err(io)?;
+        if !metadata.is_file() {
+            return Err(io(io::Error::new(io::ErrorKind::InvalidInput, "not a regular file")));
+        }
+        let mut file = File::open(path).map_err(io)?;
+        let mut magic = [0; 2];
+        let gzip = file.read_exact(&mut magic).is_ok() && magic == [0x1f, 0x8b];
+        file.seek(SeekFrom::Start(0)).map_err(io)?;
+        let file = Counting(file, 0);
+        let input = if gzip { Input::Gzip(Box::new(MultiGzDecoder::new(file))) } else { Input::Plain(file) };
+        Ok(Source {
+            path: path.into(),
+            input,
+            buffer: vec![0; BUFFER].into_boxed_slice(),
+            start: 0,
+            end: 0,
+            offset: 0,
+            line: 0,
+            file_length: metadata.len(),
+            earlier: 0,
+        })
+    }
+
+    /// Bytes read from disk, packed ones for gzip.
+    pub fn bytes_read(&self) -> u64 {
+        self.earlier
+            + match &self.input {
+                Input::Plain(file) => file.1,
+                Input::Gzip(decoder) => decoder.get_ref().1,
+            }
+    }
+
+    /// Length of the content, if that is known before reading it.
+    pub fn length(&self) -> Option<u64> {
+        matches!(self.input, Input::Plain(_)).then_some(self.file_length)
+    }
+
+    /// No more than this many bytes can still come.
+    pub fn most_left(&self) -> u64 {
+        self.length().unwrap_or(self.file_length.saturating_mul(MAX_EXPANSION)).saturating_sub(self.offset)
+    }
+
+    /// Where we are, in unpacked bytes.
+    pub fn offset(&self) -> u64 {
+        self.offset
+    }
+
+    /// Line of the last word or line read.
+    pub fn line(&self) -> u32 {
+        self.line
+    }
+
+    /// Goes to an offset, and the line that it is in; a second pass over (part of) the file.
+    pub fn seek(&mut self, offset: u64, line: u32) -> Result<(), ImportError> {
+        let mut fresh = Source::open(&self.path)?;
+        fresh.earlier = self.bytes_read();
+        match &mut fresh.input {
+            Input::Plain(file) => {
+                let io = |source| ImportError::Io { path: self.path.clone(), source };
+                file.0.seek(SeekFrom::Start(offset)).map_err(io)?;
+                fresh.offset = offset;
+            }
+            Input::Gzip(_) => fresh.skip(offset)?,
+        }
+        fresh.line = line;
+        *self = fresh;
+        Ok(())
+    }
+
+    /// An error at the last line read.
+    pub fn fail_line<T>(&self, message: impl Into<String>) -> Result<T, ImportError> {
+        let place = Place { file: self.path.clone(), line: self.line.max(1) };
+        Err(ImportError::Malformed { place, message: message.into() })
+    }
+
+    /// An error at a byte.
+    pub fn fail_byte<T>(&self, message: impl std::fmt::Display) -> Result<T, ImportError> {
+        let place = Place { file: self.path.clone(), line: 0 };
+        Err(ImportError::Malformed { place, message: format!("byte {}: {message}", self.offset) })
+    }
+
+    /// An error about a limit.
+    pub fn fail_limit<T>(&self, message: impl Into<String>) -> Result<T, ImportError> {
+        Err(ImportError::Limit { path: self.path.clone(), message: message.into() })
+    }
+
+    /// Wraps an error of the operating system.
+    pub fn io(&self, source: io::Error) -> ImportError {
+        ImportError::Io { path: self.path.clone(), source }
+    }
+
+    /// Brings at least `n` bytes into the buffer, or as many as there are.
+    fn fill(&mut self, n: usize) -> Result<(), ImportError> {
+        debug_assert!(n <= BUFFER);
+        if self.end - self.start >= n {
+            return Ok(());
+        }
+        self.buffer.copy_within(self.start..self.end, 0);
+        self.end -= self.start;
+        self.start = 0;
+        while self.end < n {
+            let room = &mut self.buffer[self.end..];
+            let result = match &mut self.input {
+                Input::Plain(file) => file.read(room),
+                Input::Gzip(decoder) => decoder.read(room),
+            };
+            match result {
+                Ok(0) => break,
+                Ok(k) => self.end += k,
+                Err(e) if e.kind() == io::ErrorKind::Interrupted => {}
+                Err(e) => return Err(ImportError::Io { path: self.path.clone(), source: e }),
+            }
+        }
+        Ok(())
+    }
+
+    /// Up to `n` of the next bytes, without passing them; fewer at the end.
+    pub fn peek(&mut self, n: usize) -> Result<&[u8], ImportError> {
+        self.fill(n)?;
+        Ok(&self.buffer[self.start..self.end.min(self.start + n)])
+    }
+
+    fn pass(&mut self, n: usize) {
+        self.start += n;
+        self.offset += n as u64;
+    }
+
+    /// The next `n` bytes (no more than 4096); it is an error when the file ends before.
+    #[inline]
+    pub fn exact(&mut self, n: usize) -> Result<&[u8], ImportError> {
+        if self.end - self.start < n {
+            self.fill(n)?;
+            if self.end - self.start < n {
+                self.pass(self.end - self.start);
+                return self.fail_byte("the file ends in the middle of its data: it is truncated, get it again");
+            }
+        }
+        let at = self.start;
+        self.pass(n);
+        Ok(&self.buffer[at..at + n])
+    }
+
+    /// Passes `n` bytes.
+    pub fn skip(&mut self, mut n: u64) -> Result<(), ImportError> {
+        while n > 0 {
+            let step = n.min(4096) as usize;
+            self.exact(step)?;
+            n -= step as u64;
+        }
+        Ok(())
+    }
+
+    /// The next line without its end (`\n` or `\r\n`); none at the end of the file.
+    pub fn line_bytes(&mut self) -> Result<Option<&[u8]>, ImportError> {
+        let mut searched = 0;
+        let length = loop {
+            match self.buffer[self.start + searched..self.end].iter().position(|b| *b == b'\n') {
+                Some(at) => break searched + at,
+                None => {
+                    searched = self.end - self.start;
+                    if searched == BUFFER {
+                        self.line += 1;
+                        return self.fail_line(format!(
+                            "a line longer than {BUFFER} bytes: this is no text file of this format"
+                        ));
+                    }
+                    self.fill(searched + 1)?;
+                    if self.end - self.start == searched {
+                        if searched == 0 {
+                            return Ok(None);
+                        }
+                        break searched;
+                    }
+                }
+            }
+        };
+        let at = self.start;
+        let ended = at + length < self.end;
+        self.pass(length + usize::from(ended));
+        self.line += 1;
+        let line = &self.buffer[at..at + length];
+        Ok(Some(line.strip_suffix(b"\r").unwrap_or(line)))
+    }
+
+    /// The next word between white space; none at the end of the file. Counts lines from the last [`Source::line_bytes`].
+    pub fn token(&mut self) -> Result<Option<&[u8]>, ImportError> {
+        loop {
+            if self.start == self.end {
+                self.fill(1)?;
+                if self.start == self.end {
+                    return Ok(None);
+                }
+            }
+            let byte = self.buffer[self.start];
+            if !byte.is_ascii_whitespace() {
+                break;
+            }
+            self.line += u32::from(byte == b'\n');
+            self.pass(1);
+        }
+        let mut length = 1;
+        loop {
+            let have = &self.buffer[self.start..self.end];
+            match have[length..].iter().position(|b| b.is_ascii_whitespace()) {
+                Some(n) => {
+                    length += n;
+                    break;
+                }
+                None if have.len() > MAX_TOKEN => {
+                    length = have.len();
+                    break;
+                }
+                None => {
+                    length = have.len();
+                    self.fill(length + 1)?;
+                    if self.end - self.start == length {
+                        break;
+                    }
+                }
+            }
+        }
+        if length > MAX_TOKEN {
+            return self
+                .fail_line(format!("a word longer than {MAX_TOKEN} bytes: this is no text file of this format"));
+        }
+        let at = self.start;
+        self.pass(length);
+        Ok(Some(&self.buffer[at..at + length]))
+    }
+
+    /// Passes the rest of a line, of any length.
+    pub fn rest_of_line(&mut self) -> Result<(), ImportError> {
+        loop {
+            self.fill(1)?;
+            let have = &self.buffer[self.start..self.end];
+            match have.iter().position(|b| *b == b'\n') {
+                // the line end is counted by the next word
+                Some(n) => {
+                    self.pass(n);
+                    return Ok(());
+                }
+                None if have.is_empty() => return Ok(()),
+                None => self.pass(have.len()),
+            }
+        }
+    }
+
+    /// After reading lines, before reading words: we are in the line after the last one read.
+    pub fn begin_tokens(&mut self) {
+        self.line += 1;
+    }
+}
+
+/// A number in text; infinities and NaN are numbers here, and preparing skips what has them.
+pub(super) fn number<T: std::str::FromStr>(text: &[u8]) -> Option<T> {
+    std::str::from_utf8(text).ok()?.parse().ok()
+}
+
+/// Text for a message: short, and without control characters.
+pub(super) fn show(text: &[u8]) -> String {
+    let text = String::from_utf8_lossy(&text[..text.len().min(60)]);
+    text.chars().map(|c| if c.is_control() { '?' } else { c }).collect()
+}
