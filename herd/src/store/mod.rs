@@ -3,15 +3,23 @@
 #[cfg(any(test, feature = "testing"))]
 pub mod conformance;
 mod directory;
+mod faulty;
 mod key;
 mod memory;
+mod retrying;
+mod s3;
+#[cfg(any(test, feature = "testing"))]
+pub mod s3_server;
 
 use async_trait::async_trait;
 use bytes::Bytes;
 
 pub use directory::DirectoryStore;
+pub use faulty::{FaultPlan, Faulty, Injected};
 pub use key::{check_key, check_prefix};
 pub use memory::MemoryStore;
+pub use retrying::{RetryPolicy, Retrying};
+pub use s3::{S3Credentials, S3Settings, S3Store};
 
 /// A flat space of named, immutable objects.
 ///
@@ -89,6 +97,14 @@ pub enum StoreError {
         /// Which object.
         key: String,
         /// What does not match.
+        message: String,
+    },
+    /// It cannot work as it was set up: correct the address, the bucket or the environment.
+    #[error("{store}: {message}")]
+    Misconfigured {
+        /// Which store.
+        store: String,
+        /// What is wrong, and what to do.
         message: String,
     },
     /// The key breaks the rules.

@@ -1,0 +1,407 @@
+//! Objects in an S3 bucket. Only this file knows S3.
+//!
+//! Plain S3 and nothing newer than what MinIO of 2021 has: one put, get, head, list (version 2) and batch delete.
+
+use std::time::Duration;
+
+use async_trait::async_trait;
+use aws_sdk_s3::Client;
+use aws_sdk_s3::config::http::HttpResponse;
+use aws_sdk_s3::config::retry::RetryConfig;
+use aws_sdk_s3::config::timeout::TimeoutConfig;
+use aws_sdk_s3::config::{
+    BehaviorVersion, Credentials, Region, RequestChecksumCalculation, ResponseChecksumValidation, SharedHttpClient,
+};
+use aws_sdk_s3::error::{ProvideErrorMetadata, SdkError};
+use aws_sdk_s3::primitives::ByteStream;
+use aws_sdk_s3::types::{Delete, ObjectIdentifier};
+use aws_smithy_http_client::tls::Provider;
+use aws_smithy_http_client::tls::rustls_provider::CryptoMode;
+use bytes::{Bytes, BytesMut};
+use md5::{Digest, Md5};
+
+use super::{BlockStore, StoreError, check_key, check_prefix};
+
+/// Most that S3 takes in one put.
+const LARGEST: u64 = 5 << 30;
+/// Most keys in one batch delete.
+const BATCH: usize = 1000;
+/// Longest prefix of a store: with our longest key it stays below S3's 1024 bytes.
+const LONGEST_PREFIX: usize = 200;
+
+/// Which bucket, where, and as whom.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct S3Settings {
+    /// Name of the bucket.
+    pub bucket: String,
+    /// Where in the bucket all keys go, without slashes at its ends; may be empty.
+    pub prefix: String,
+    /// `http://host:port` or `https://host`; AWS itself when absent.
+    pub endpoint: Option<String>,
+    /// Region; most servers that are not AWS ignore it.
+    pub region: String,
+    /// `endpoint/bucket/key` instead of `bucket.endpoint/key`.
+    pub path_style: bool,
+    /// As whom.
+    pub credentials: S3Credentials,
+}
+
+/// An access key. The secrets do not show in `Debug`.
+#[derive(Clone, PartialEq, Eq)]
+pub struct S3Credentials {
+    /// Its public part.
+    pub access_key: String,
+    /// Its secret part.
+    pub secret_key: String,
+    /// For temporary keys.
+    pub session_token: Option<String>,
+}
+
+impl std::fmt::Debug for S3Credentials {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("S3Credentials").field("access_key", &self.access_key).finish_non_exhaustive()
+    }
+}
+
+impl S3Settings {
+    /// From `s3://bucket/prefix`, an endpoint (else `AWS_ENDPOINT_URL_S3`, `AWS_ENDPOINT_URL`, else AWS itself), and
+    /// the environment: `AWS_REGION` (or `AWS_DEFAULT_REGION`, else us-east-1), `AWS_ACCESS_KEY_ID`,
+    /// `AWS_SECRET_ACCESS_KEY`, `AWS_SESSION_TOKEN`.
+    pub fn from_url(url: &str, endpoint: Option<&str>) -> Result<Self, StoreError> {
+        Self::from_url_and(url, endpoint, |name| std::env::var(name).ok().filter(|value| !value.is_empty()))
+    }
+
+    fn from_url_and(
+        url: &str,
+        endpoint: Option<&str>,
+        variable: impl Fn(&str) -> Option<String>,
+    ) -> Result<Self, StoreError> {
+        let wrong = |message: String| StoreError::Misconfigured { store: url.to_owned(), message };
+        let path = url.strip_prefix("s3://").ok_or_else(|| wrong("an S3 address is s3://bucket/prefix".to_owned()))?;
+        let (bucket, prefix) = path.split_once('/').unwrap_or((path, ""));
+        let endpoint = endpoint.map(str::to_owned);
+        let endpoint = endpoint.or_else(|| variable("AWS_ENDPOINT_URL_S3")).or_else(|| variable("AWS_ENDPOINT_URL"));
+        let key = |name: &str| {
+            let hint = "set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY";
+            variable(name).ok_or_else(|| wrong(format!("no credentials: {name} is not set ({hint})")))
+        };
+        let settings = S3Settings {
+            bucket: bucket.to_owned(),
+            prefix: prefix.trim_end_matches('/').to_owned(),
+            region: variable("AWS_REGION")
+                .or_else(|| variable("AWS_DEFAULT_REGION"))
+                .unwrap_or_else(|| "us-east-1".to_owned()),
+            // AWS wants names of buckets in the host; everybody else works without DNS entries per bucket
+            path_style: endpoint.is_some(),
+            endpoint,
+            credentials: S3Credentials {
+                access_key: key("AWS_ACCESS_KEY_ID")?,
+                secret_key: key("AWS_SECRET_ACCESS_KEY")?,
+                session_token: variable("AWS_SESSION_TOKEN"),
+            },
+        };
+        settings.check()?;
+        Ok(settings)
+    }
+
+    /// `s3://bucket/prefix`.
+    pub fn url(&self) -> String {
+        let slash = if self.prefix.is_empty() { "" } else { "/" };
+        format!("s3://{}{slash}{}", self.bucket, self.prefix)
+    }
+
+    fn check(&self) -> Result<(), StoreError> {
+        let wrong = |message: String| Err(StoreError::Misconfigured { store: self.url(), message });
+        let plain = |b: u8| b.is_ascii_lowercase() || b.is_ascii_digit() || matches!(b, b'-' | b'.');
+        if !(3..=63).contains(&self.bucket.len()) || !self.bucket.bytes().all(plain) {
+            return wrong("a bucket's name has 3 to 63 lower case letters, digits, hyphens and dots".to_owned());
+        }
+        if !self.prefix.is_empty()
+            && let Err(e) = check_key(&self.prefix)
+        {
+            return wrong(format!("the prefix cannot be used: {e}"));
+        }
+        if self.prefix.len() > LONGEST_PREFIX {
+            return wrong(format!("the prefix is longer than {LONGEST_PREFIX} bytes"));
+        }
+        match self.endpoint.as_deref().map(|e| e.split_once("://")) {
+            None => Ok(()),
+            Some(Some(("http" | "https", host))) if !host.trim_matches('/').is_empty() => Ok(()),
+            Some(_) => wrong(format!(
+                "the endpoint {:?} is no http:// or https:// address",
+                self.endpoint.as_deref().unwrap_or_default()
+            )),
+        }
+    }
+}
+
+/// Objects in a bucket, below a prefix. Does not retry: [`super::Retrying`] does.
+#[derive(Clone, Debug)]
+pub struct S3Store {
+    client: Client,
+    bucket: String,
+    /// Empty, or ending with a slash.
+    prefix: String,
+    name: String,
+}
+
+impl S3Store {
+    /// Makes the client and looks whether the bucket answers.
+    pub async fn connect(settings: S3Settings) -> Result<Self, StoreError> {
+        settings.check()?;
+        let store = S3Store {
+            client: client(&settings),
+            name: settings.url(),
+            prefix: if settings.prefix.is_empty() { String::new() } else { settings.prefix + "/" },
+            bucket: settings.bucket,
+        };
+        // listing, not heading the bucket: the answer to HEAD has no body that says why not
+        let probe = store.client.list_objects_v2().bucket(&store.bucket).prefix(&store.prefix).max_keys(1).send();
+        probe.await.map_err(|e| store.failure("open", "", 0, e))?;
+        Ok(store)
+    }
+
+    fn path(&self, key: &str) -> String {
+        format!("{}{key}", self.prefix)
+    }
+
+    /// What an SDK error means to the caller.
+    fn failure<E>(&self, action: &'static str, key: &str, bytes: u64, error: SdkError<E, HttpResponse>) -> StoreError
+    where
+        E: ProvideErrorMetadata + std::error::Error + 'static,
+    {
+        let (store, key) = (self.name.clone(), key.to_owned());
+        let service = match &error {
+            SdkError::ServiceError(e) => e,
+            SdkError::ConstructionFailure(_) => {
+                return StoreError::Denied { store, action, key, message: causes(&error) };
+            }
+            // no answer, half an answer, none in time
+            _ => return StoreError::Unavailable { store, action, key, message: causes(&error) },
+        };
+        let status = service.raw().status().as_u16();
+        let code = service.err().code().unwrap_or_default();
+        let text = service.err().message().unwrap_or_default();
+        let message = [code, text].into_iter().filter(|t| !t.is_empty()).collect::<Vec<_>>().join(": ");
+        let message = if message.is_empty() { format!("HTTP {status}") } else { format!("{message} (HTTP {status})") };
+        self.classify(action, key, bytes, status, code, message)
+    }
+
+    fn classify(
+        &self,
+        action: &'static str,
+        key: String,
+        bytes: u64,
+        status: u16,
+        code: &str,
+        message: String,
+    ) -> StoreError {
+        let store = self.name.clone();
+        match (code, status) {
+            ("NoSuchBucket", _) => {
+                StoreError::Misconfigured { store, message: format!("there is no bucket {}: create it", self.bucket) }
+            }
+            ("NoSuchKey" | "NotFound", _) => StoreError::NotFound { store, key },
+            // MinIO on a file system
+            ("XMinioParentIsObject" | "XMinioObjectExistsAsDirectory", _) => {
+                StoreError::InvalidKey { key, message: format!("a key cannot be a folder of another ({message})") }
+            }
+            ("XMinioStorageFull" | "QuotaExceeded" | "XMinioAdminBucketQuotaExceeded", _) | (_, 507) => {
+                StoreError::Full { store, key, bytes }
+            }
+            ("RequestTimeTooSkewed", _) => {
+                let message = format!("{message}: this machine's clock and the server's differ");
+                StoreError::Denied { store, action, key, message }
+            }
+            ("PermanentRedirect" | "AuthorizationHeaderMalformed", _) => {
+                let message = format!("{message}: the bucket is in another region (set AWS_REGION)");
+                StoreError::Misconfigured { store, message }
+            }
+            // RequestTimeout comes with 400
+            ("SlowDown" | "RequestTimeout" | "InternalError" | "ServiceUnavailable" | "OperationAborted", _)
+            | (_, 408 | 429 | 500..=599) => StoreError::Unavailable { store, action, key, message },
+            _ => StoreError::Denied { store, action, key, message },
+        }
+    }
+
+    fn broken(&self, action: &'static str, key: &str, message: impl Into<String>) -> StoreError {
+        StoreError::Unavailable { store: self.name.clone(), action, key: key.to_owned(), message: message.into() }
+    }
+
+    async fn delete_batch(&self, keys: &[String]) -> Result<(), StoreError> {
+        let first = &keys[0];
+        let unbuildable = |e: aws_sdk_s3::error::BuildError| self.broken("delete", first, e.to_string());
+        let objects: Result<Vec<_>, _> =
+            keys.iter().map(|k| ObjectIdentifier::builder().key(self.path(k)).build()).collect();
+        let batch = Delete::builder().set_objects(Some(objects.map_err(unbuildable)?)).quiet(true).build();
+        let request = self.client.delete_objects().bucket(&self.bucket).delete(batch.map_err(unbuildable)?);
+        // S3 takes any of several checksums here and the SDK sends a newer one, but MinIO of 2021 knows only this
+        let request = request.customize().mutate_request(|http| {
+            if let Some(sum) = http.body().bytes().map(Md5::digest) {
+                http.headers_mut().insert("content-md5", aws_smithy_types::base64::encode(sum));
+            }
+        });
+        let done = request.send().await.map_err(|e| self.failure("delete", first, 0, e))?;
+        for error in done.errors() {
+            let code = error.code().unwrap_or_default();
+            if code == "NoSuchKey" {
+                continue;
+            }
+            let path = error.key().unwrap_or_default();
+            let key = path.strip_prefix(&self.prefix).unwrap_or(path).to_owned();
+            let message = format!("{code}: {}", error.message().unwrap_or_default());
+            return Err(self.classify("delete", key, 0, 200, code, message));
+        }
+        Ok(())
+    }
+}
+
+#[async_trait]
+impl BlockStore for S3Store {
+    async fn put(&self, key: &str, body: Bytes) -> Result<(), StoreError> {
+        check_key(key)?;
+        let bytes = body.len() as u64;
+        if bytes > LARGEST {
+            let message = format!("{bytes} bytes, and S3 takes at most {LARGEST} in one put: use smaller blocks");
+            return Err(StoreError::Denied { store: self.name.clone(), action: "put", key: key.to_owned(), message });
+        }
+        let request = self.client.put_object().bucket(&self.bucket).key(self.path(key)).body(ByteStream::from(body));
+        request.send().await.map(drop).map_err(|e| self.failure("put", key, bytes, e))
+    }
+
+    async fn get(&self, key: &str) -> Result<Bytes, StoreError> {
+        check_key(key)?;
+        let request = self.client.get_object().bucket(&self.bucket).key(self.path(key)).send();
+        let mut response = request.await.map_err(|e| self.failure("get", key, 0, e))?;
+        let announced = response.content_length().and_then(|n| u64::try_from(n).ok());
+        let length = announced.ok_or_else(|| self.broken("get", key, "the answer does not say how long it is"))?;
+        if length > LARGEST {
+            return Err(self.broken("get", key, format!("{length} bytes: nothing that large was put")));
+        }
+        let mut body = BytesMut::with_capacity(length as usize);
+        loop {
+            match response.body.try_next().await {
+                Ok(Some(part)) if (body.len() + part.len()) as u64 <= length => body.extend_from_slice(&part),
+                Ok(Some(_)) => return Err(self.broken("get", key, format!("more than {length} bytes came"))),
+                Ok(None) if body.len() as u64 == length => return Ok(body.freeze()),
+                Ok(None) => return Err(self.broken("get", key, format!("{} of {length} bytes came", body.len()))),
+                Err(e) => return Err(self.broken("get", key, causes(&e))),
+            }
+        }
+    }
+
+    async fn size(&self, key: &str) -> Result<Option<u64>, StoreError> {
+        check_key(key)?;
+        let request = self.client.head_object().bucket(&self.bucket).key(self.path(key)).send();
+        match request.await {
+            Ok(head) => match head.content_length().map(u64::try_from) {
+                Some(Ok(length)) => Ok(Some(length)),
+                _ => Err(self.broken("size", key, "the answer does not say how long it is")),
+            },
+            // HEAD's answers have no body, hence no code: the bucket was there in `connect`
+            Err(SdkError::ServiceError(e)) if e.raw().status().as_u16() == 404 => Ok(None),
+            Err(e) => Err(self.failure("size", key, 0, e)),
+        }
+    }
+
+    async fn list(&self, prefix: &str) -> Result<Vec<(String, u64)>, StoreError> {
+        check_prefix(prefix)?;
+        let mut found = Vec::new();
+        let mut from: Option<String> = None;
+        loop {
+            let request = self.client.list_objects_v2().bucket(&self.bucket).prefix(self.path(prefix));
+            let request = request.set_continuation_token(from.clone()).send();
+            let page = request.await.map_err(|e| self.failure("list", prefix, 0, e))?;
+            for object in page.contents() {
+                let key = object.key().and_then(|k| k.strip_prefix(&self.prefix));
+                // what others put into the bucket under names that we do not use is not ours
+                let Some(key) = key.filter(|k| check_key(k).is_ok()) else { continue };
+                found.push((key.to_owned(), object.size().and_then(|n| u64::try_from(n).ok()).unwrap_or(0)));
+            }
+            if page.is_truncated() != Some(true) {
+                break;
+            }
+            let next = page.next_continuation_token().map(str::to_owned);
+            if next.is_none() || next == from {
+                return Err(self.broken("list", prefix, "a page names no next one"));
+            }
+            from = next;
+        }
+        // S3 sorts by bytes; not every server does
+        found.sort_unstable();
+        found.dedup();
+        Ok(found)
+    }
+
+    async fn delete(&self, keys: &[String]) -> Result<(), StoreError> {
+        keys.iter().try_for_each(|key| check_key(key))?;
+        for batch in keys.chunks(BATCH) {
+            self.delete_batch(batch).await?;
+        }
+        Ok(())
+    }
+
+    fn describe(&self) -> String {
+        self.name.clone()
+    }
+}
+
+/// The one place where S3 clients are made.
+fn client(settings: &S3Settings) -> Client {
+    let credentials = &settings.credentials;
+    let credentials = Credentials::new(
+        &credentials.access_key,
+        &credentials.secret_key,
+        credentials.session_token.clone(),
+        None,
+        "rayherd settings",
+    );
+    let mut config = aws_sdk_s3::Config::builder()
+        .behavior_version(BehaviorVersion::v2026_01_12())
+        .http_client(http_client(settings))
+        .credentials_provider(credentials)
+        .region(Region::new(settings.region.clone()))
+        .force_path_style(settings.path_style)
+        // MinIO of 2021 and others do not know the checksums that the SDK adds by default since 2025
+        .request_checksum_calculation(RequestChecksumCalculation::WhenRequired)
+        .response_checksum_validation(ResponseChecksumValidation::WhenRequired)
+        // the retrying layer counts and bounds retries, for every store alike
+        .retry_config(RetryConfig::disabled())
+        // none for a whole operation, which may move gigabytes: the SDK gives up on stalled streams by itself
+        .timeout_config(
+            TimeoutConfig::builder()
+                .connect_timeout(Duration::from_secs(5))
+                .read_timeout(Duration::from_secs(30))
+                .build(),
+        );
+    if let Some(endpoint) = &settings.endpoint {
+        config = config.endpoint_url(endpoint);
+    }
+    Client::from_conf(config.build())
+}
+
+/// Plain HTTP where the endpoint says so; else TLS by rustls with ring, the one crypto provider of the program.
+fn http_client(settings: &S3Settings) -> SharedHttpClient {
+    let builder = aws_smithy_http_client::Builder::new();
+    if settings.endpoint.as_deref().is_some_and(|e| e.starts_with("http://")) {
+        return builder.build_http();
+    }
+    builder.tls_provider(Provider::Rustls(CryptoMode::Ring)).build_https()
+}
+
+/// An error with its causes in one line.
+fn causes(error: &dyn std::error::Error) -> String {
+    let mut text = error.to_string();
+    let mut cause = error.source();
+    while let Some(e) = cause {
+        let part = e.to_string();
+        if !text.ends_with(&part) {
+            text = format!("{text}: {part}");
+        }
+        cause = e.source();
+    }
+    text
+}
+
+#[cfg(test)]
+mod tests;
