@@ -277,10 +277,12 @@ fn fan(p: &[u8], triangles: &mut Vec<[u8; 3]>, centers: &mut Vec<u16>) {
     triangles.extend((0..p.len()).map(|i| [p[i], p[(i + 1) % p.len()], c]));
 }
 
+/// Around a vertex in the middle where it must be, and from 8 sides on: such a disc is a saddle, whose middle no inner edge
+/// comes near (Lewiner does the same).
 fn disc(p: &[u8], triangles: &mut Vec<[u8; 3]>, centers: &mut Vec<u16>) {
     match polygon(p) {
-        Some((_, t)) => triangles.extend(t),
-        None => fan(p, triangles, centers),
+        Some((_, t)) if p.len() < 8 => triangles.extend(t),
+        _ => fan(p, triangles, centers),
     }
 }
 
