@@ -3,7 +3,9 @@
 //! World space is LPS in millimetres, DICOM's: x to the patient's left, y to the back, z to the head. NIfTI's RAS and NRRD's
 //! named spaces are converted.
 
+mod dicom;
 mod layout;
+mod nifti;
 mod nrrd;
 mod slices;
 
@@ -76,22 +78,60 @@ impl VolumeFile {
     }
 }
 
-/// Opens a volume; the format is told from the content: an NRRD or NHDR file.
-pub fn open(path: &Path) -> Result<VolumeFile, ImportError> {
-    let io = |source| ImportError::Io { path: path.to_owned(), source };
-    let mut magic = [0; 4];
-    let mut file = File::open(path).map_err(io)?;
-    let mut have = 0;
-    while have < magic.len() {
-        match file.read(&mut magic[have..]).map_err(io)? {
-            0 => break,
-            n => have += n,
+/// Whether `path` is a volume that [`open`] knows: an NRRD or NIfTI file, a DICOM file, or a folder with one in it. Told from
+/// the content.
+pub fn is_volume(path: &Path) -> Result<bool, ImportError> {
+    if path.is_dir() {
+        let io = |source| ImportError::Io { path: path.to_owned(), source };
+        for entry in std::fs::read_dir(path).map_err(io)? {
+            let file = entry.map_err(io)?.path();
+            if file.is_file() && matches!(format(&file)?, Some(Format::Dicom)) {
+                return Ok(true);
+            }
         }
+        return Ok(false);
     }
-    if &magic == b"NRRD" {
-        return nrrd::open(path);
+    Ok(format(path)?.is_some())
+}
+
+/// Opens a volume: an NRRD, NHDR or NIfTI file (also gzipped), a folder with a DICOM series, or one DICOM file, which
+/// stands for all of its series in its folder. The format is told from the content. Headers are read and checked; sizes are
+/// compared with those of the files.
+///
+/// # Errors
+/// What cannot be read, is malformed or not supported, with the file that is to blame.
+pub fn open(path: &Path) -> Result<VolumeFile, ImportError> {
+    if path.is_dir() {
+        return dicom::open_folder(path);
     }
-    Err(malformed(path, 0, "not an NRRD or NHDR file"))
+    match format(path)? {
+        Some(Format::Nrrd) => nrrd::open(path),
+        Some(Format::Nifti(header)) => nifti::open(path, &header),
+        Some(Format::Dicom) => dicom::open_file(path),
+        None => Err(malformed(path, 0, "not a volume: neither NRRD nor NIfTI nor DICOM by its content")),
+    }
+}
+
+enum Format {
+    Nrrd,
+    Nifti(nifti::Header),
+    Dicom,
+}
+
+fn format(path: &Path) -> Result<Option<Format>, ImportError> {
+    let io = |source| ImportError::Io { path: path.to_owned(), source };
+    if !std::fs::metadata(path).map_err(io)?.is_file() {
+        return Ok(None); // opening a pipe would wait for ever
+    }
+    let mut first = Vec::new();
+    File::open(path).map_err(io)?.take(132).read_to_end(&mut first).map_err(io)?;
+    if first.starts_with(b"NRRD000") {
+        return Ok(Some(Format::Nrrd));
+    }
+    if dicom::is_dicom(&first) {
+        return Ok(Some(Format::Dicom));
+    }
+    Ok(nifti::recognise(path).map_err(io)?.map(Format::Nifti))
 }
 
 /// An error of the content.

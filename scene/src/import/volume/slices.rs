@@ -75,9 +75,15 @@ impl<'a> Slices<'a> {
 }
 
 /// Counts what is read from a file.
-struct Counted {
-    file: File,
-    bytes: Rc<Cell<u64>>,
+pub(super) struct Counted {
+    pub file: File,
+    pub bytes: Rc<Cell<u64>>,
+}
+
+impl Seek for Counted {
+    fn seek(&mut self, to: SeekFrom) -> io::Result<u64> {
+        self.file.seek(to)
+    }
 }
 
 impl Read for Counted {
