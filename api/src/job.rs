@@ -91,10 +91,10 @@ pub struct SceneSpec {
     /// Value of the surface to extract from a volume, in its rescaled units (Hounsfield for CT).
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub iso: Option<f64>,
-    /// Lights added to a mesh or volume, instead of the two that frame it, each as `--light` takes it.
+    /// Rectangular lights: of a mesh or volume instead of the two that frame it, of an XML scene beside its own.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
-    pub lights: Vec<String>,
-    /// Radiance of a constant sky: one number or three (linear RGB), instead of the scene's.
+    pub lights: Vec<LightSpec>,
+    /// Radiance of a constant sky: one number or three (linear RGB), instead of the scene's; 0 is no sky.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub sky: Option<Vec<f64>>,
     /// Reflectance of a mesh or volume: one number or three (linear RGB) in 0 to 1.
@@ -105,7 +105,21 @@ pub struct SceneSpec {
     pub substitute: bool,
     /// Values for the parameters of a Mitsuba file (`$name`).
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
-    pub parameters: BTreeMap<String, String>,
+    pub define: BTreeMap<String, String>,
+}
+
+/// A rectangle that shines from `origin` towards `target`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "camelCase", deny_unknown_fields)]
+pub struct LightSpec {
+    /// Its centre, in the scene's coordinates.
+    pub origin: [f64; 3],
+    /// A point that its front looks at.
+    pub target: [f64; 3],
+    /// Width and height, above 0.
+    pub size: [f64; 2],
+    /// Radiance (W/sr/m2): one number or three (linear RGB).
+    pub radiance: Vec<f64>,
 }
 
 /// The picture or pictures.
@@ -162,6 +176,10 @@ pub struct SamplingSpec {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[schemars(range(min = 0.0))]
     pub target_error: Option<f64>,
+    /// Seconds after which no further step of samples is started.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schemars(range(min = 0.0))]
+    pub time_limit: Option<f64>,
     /// Most rays in a path, shadow rays not counted: 1 sees emitters only.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[schemars(range(min = 1, max = 65535))]

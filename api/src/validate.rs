@@ -33,16 +33,23 @@ pub fn validate(job: &RenderJob) -> Vec<Problem> {
     if let Some(iso) = scene.iso {
         c.check("spec.scene.iso", iso.is_finite(), || format!("is {iso}: give a finite value"));
     }
-    for (field, colour, most) in [("sky", &scene.sky, f64::INFINITY), ("albedo", &scene.albedo, 1.0)] {
-        let Some(colour) = colour else { continue };
-        let field = format!("spec.scene.{field}");
-        c.check(&field, matches!(colour.len(), 1 | 3), || {
-            format!("has {} numbers: give one, or three for red, green and blue", colour.len())
+    for (i, light) in scene.lights.iter().enumerate() {
+        let field = |name: &str| format!("spec.scene.lights[{i}].{name}");
+        c.finite(&field("origin"), &light.origin);
+        c.finite(&field("target"), &light.target);
+        c.check(&field("target"), light.target != light.origin, || {
+            "is the light's origin: choose a point that its front looks at".into()
         });
-        c.check(&field, colour.iter().all(|v| v.is_finite() && (0.0..=most).contains(v)), || {
-            let upper = if most.is_finite() { format!(" to {most}") } else { " or more".into() };
-            format!("is {colour:?}: each number must be 0{upper}")
+        c.check(&field("size"), light.size.iter().all(|x| x.is_finite() && *x > 0.0), || {
+            format!("is {:?}: give a width and a height above 0", light.size)
         });
+        c.colour(&field("radiance"), &light.radiance, f64::from(f32::MAX));
+    }
+    if let Some(sky) = &scene.sky {
+        c.colour("spec.scene.sky", sky, f64::from(f32::MAX));
+    }
+    if let Some(albedo) = &scene.albedo {
+        c.colour("spec.scene.albedo", albedo, 1.0);
     }
 
     check_image(&mut c, job);
@@ -52,6 +59,11 @@ pub fn validate(job: &RenderJob) -> Vec<Problem> {
     if let Some(error) = sampling.target_error {
         c.check("spec.sampling.targetError", error.is_finite() && error > 0.0, || {
             format!("is {error}: give a relative squared error above 0, such as 0.01")
+        });
+    }
+    if let Some(seconds) = sampling.time_limit {
+        c.check("spec.sampling.timeLimit", seconds.is_finite() && seconds > 0.0, || {
+            format!("is {seconds}: give seconds above 0")
         });
     }
     c.range("spec.sampling.maxDepth", integer(sampling.max_depth), 1.0, 65535.0);
@@ -90,7 +102,7 @@ fn check_image(c: &mut Checks, job: &RenderJob) {
         }
         let vectors = [("origin", camera.origin), ("target", camera.target), ("up", camera.up)];
         for (name, v) in vectors {
-            c.check(&field(name), v.iter().all(|x| x.is_finite()), || format!("is {v:?}: give finite numbers"));
+            c.finite(&field(name), &v);
         }
         let view: [f64; 3] = std::array::from_fn(|k| camera.target[k] - camera.origin[k]);
         c.check(&field("target"), view.iter().any(|&x| x != 0.0), || {
@@ -144,6 +156,18 @@ impl Checks {
             self.0.push(Problem { field: field.to_owned(), message: message() });
         }
     }
+    fn finite(&mut self, field: &str, numbers: &[f64]) {
+        self.check(field, numbers.iter().all(|x| x.is_finite()), || format!("is {numbers:?}: give finite numbers"));
+    }
+    /// One number or three, 0 to `most`.
+    fn colour(&mut self, field: &str, colour: &[f64], most: f64) {
+        self.check(field, matches!(colour.len(), 1 | 3), || {
+            format!("has {} numbers: give one, or three for red, green and blue", colour.len())
+        });
+        self.check(field, colour.iter().all(|v| (0.0..=most).contains(v)), || {
+            format!("is {colour:?}: give numbers from 0 to {most}")
+        });
+    }
     fn range(&mut self, field: &str, value: Option<f64>, lo: f64, hi: f64) {
         if let Some(value) = value {
             self.check(field, (lo..=hi).contains(&value), || format!("is {value}: give {lo} to {hi}"));
@@ -164,7 +188,7 @@ metadata:
   labels: {team: herd}
   uid: left-alone
 spec:
-  scene: {source: chest, iso: -789.5, albedo: [0.7], sky: [0.1, 0.2, 0.3], parameters: {spp: '4'}}
+  scene: {source: chest, iso: -789.5, albedo: [0.7], sky: [0.1, 0.2, 0.3], define: {spp: '4'}, lights: [{origin: [0, 5, 0], target: [0, 0, 0], size: [1, 1], radiance: [10]}]}
   image:
     size: 256x256
     cameras:
@@ -231,6 +255,9 @@ spec:
         spec.scene.iso = Some(f64::NAN);
         spec.scene.sky = Some(vec![1.0, 2.0]);
         spec.scene.albedo = Some(vec![1.5]);
+        spec.scene.lights[0].target = spec.scene.lights[0].origin;
+        spec.scene.lights[0].size = [1.0, 0.0];
+        spec.scene.lights[0].radiance = vec![];
         spec.image.cameras[0].target = spec.image.cameras[0].origin;
         spec.image.cameras[1].up = [0.0, 0.0, 1.0];
         spec.image.cameras[1].fov = 180.0;
@@ -239,6 +266,7 @@ spec:
         spec.image.exposure = Some(f64::INFINITY);
         spec.sampling.spp = Some(1 << 25);
         spec.sampling.target_error = Some(0.0);
+        spec.sampling.time_limit = Some(f64::NAN);
         spec.sampling.max_depth = Some(0);
         spec.sampling.split = Some(-1);
         spec.sampling.seed = Some(-7);
@@ -254,6 +282,9 @@ spec:
             "kind",
             "spec.scene.source",
             "spec.scene.iso",
+            "spec.scene.lights[0].target",
+            "spec.scene.lights[0].size",
+            "spec.scene.lights[0].radiance",
             "spec.scene.sky",
             "spec.scene.albedo",
             "spec.image.cameras[0].target",
@@ -265,6 +296,7 @@ spec:
             "spec.image.exposure",
             "spec.sampling.spp",
             "spec.sampling.targetError",
+            "spec.sampling.timeLimit",
             "spec.sampling.maxDepth",
             "spec.sampling.split",
             "spec.sampling.seed",
