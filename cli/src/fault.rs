@@ -3,6 +3,9 @@
 use std::io;
 
 use rayherd_scene::ImportError;
+use rayherd_scene::manifest::ManifestError;
+use rayherd_scene::objects::ObjectError;
+use rayherd_scene::prepare::PrepareError;
 
 /// Something that the user can put right. The message says what and where, and what to do.
 #[derive(Debug, thiserror::Error)]
@@ -11,19 +14,60 @@ pub struct Mistake(pub String);
 
 /// 2 when the user can put it right, 1 when it is ours or the machine's.
 pub fn exit_code(error: &anyhow::Error) -> u8 {
-    let theirs = error.chain().any(|cause| {
-        cause.is::<Mistake>()
-            || cause.downcast_ref::<ImportError>().is_some_and(|e| match e {
-                ImportError::Io { source, .. } => is_wrong_path(source),
-                ImportError::Malformed { .. } | ImportError::Unsupported(_) | ImportError::Limit { .. } => true,
-            })
-    });
-    if theirs { 2 } else { 1 }
+    if error.chain().any(is_users) { 2 } else { 1 }
+}
+
+fn is_users(cause: &(dyn std::error::Error + 'static)) -> bool {
+    cause.is::<Mistake>()
+        || cause.downcast_ref().is_some_and(import_is_users)
+        || cause.downcast_ref().is_some_and(object_is_users)
+        || cause.downcast_ref().is_some_and(|e| match e {
+            // transparent errors do not show in the chain themselves
+            PrepareError::Import(e) => import_is_users(e),
+            PrepareError::Store(e) => object_is_users(e),
+            PrepareError::Settings(_)
+            | PrepareError::Empty { .. }
+            | PrepareError::Build { .. }
+            | PrepareError::TooManySplits(_) => true,
+            PrepareError::Inconsistent(_) | PrepareError::Spool { .. } => false,
+        })
+        || cause.downcast_ref().is_some_and(|e| match e {
+            ManifestError::Malformed(_) | ManifestError::Format { .. } => true,
+            ManifestError::Store(e) => object_is_users(e),
+        })
+}
+
+fn import_is_users(error: &ImportError) -> bool {
+    match error {
+        ImportError::Io { source, .. } => is_wrong_path(source),
+        ImportError::Malformed { .. } | ImportError::Unsupported(_) | ImportError::Limit { .. } => true,
+    }
+}
+
+fn object_is_users(error: &ObjectError) -> bool {
+    match error {
+        // what is gone or broken is prepared again, as the message says
+        ObjectError::Missing { .. } | ObjectError::Corrupt { .. } | ObjectError::Name { .. } => true,
+        ObjectError::Failed { source, .. } => source.downcast_ref().is_some_and(is_wrong_path),
+    }
 }
 
 fn is_wrong_path(error: &io::Error) -> bool {
     use io::ErrorKind::*;
     matches!(error.kind(), NotFound | PermissionDenied | NotADirectory | IsADirectory | InvalidInput | InvalidFilename)
+}
+
+/// An error and its causes in one line; a cause that the text before it tells already is left out.
+pub fn tell(error: &anyhow::Error) -> String {
+    let mut told = String::new();
+    for cause in error.chain().map(ToString::to_string) {
+        if told.is_empty() {
+            told = cause;
+        } else if !told.contains(&cause) {
+            told = format!("{told}: {cause}");
+        }
+    }
+    told
 }
 
 /// Prints a panic as one short message that says how to report it. The process must then exit with 1.
@@ -40,4 +84,26 @@ pub fn install_panic_hook() {
              please report it with the command, the scene and the output of the same command with RUST_BACKTRACE=1"
         );
     }));
+}
+
+#[cfg(test)]
+mod tests {
+    use anyhow::Context;
+
+    use super::*;
+
+    #[test]
+    fn causes_are_told_once_and_faults_are_told_apart() {
+        let missing = || io::Error::from(io::ErrorKind::NotFound);
+        let error = ImportError::Io { path: "a.xml".into(), source: missing() };
+        let error = anyhow::Error::new(error).context("cannot prepare a.xml");
+        assert_eq!(tell(&error), "cannot prepare a.xml: cannot read a.xml: entity not found");
+        assert_eq!(exit_code(&error), 2);
+        let transparent = PrepareError::Import(ImportError::Io { path: "a.ply".into(), source: missing() });
+        assert_eq!(exit_code(&transparent.into()), 2);
+        assert_eq!(exit_code(&Mistake("no".into()).into()), 2);
+        assert_eq!(exit_code(&anyhow::Error::new(missing())), 1);
+        let error = Err::<(), _>(io::Error::other("disk on fire")).context("cannot write").unwrap_err();
+        assert_eq!((tell(&error).as_str(), exit_code(&error)), ("cannot write: disk on fire", 1));
+    }
 }

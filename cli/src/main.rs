@@ -3,7 +3,9 @@
 mod commands;
 mod fault;
 mod log;
+mod options;
 mod output;
+mod source;
 
 use std::process::ExitCode;
 
@@ -31,7 +33,7 @@ fn main() -> ExitCode {
     match std::panic::catch_unwind(|| commands::run(arguments.command)) {
         Ok(Ok(code)) => code,
         Ok(Err(error)) => {
-            eprintln!("error: {error:#}");
+            eprintln!("error: {}", fault::tell(&error));
             fault::exit_code(&error).into()
         }
         // the panic hook has told it

@@ -16,13 +16,21 @@ use crate::output::{Picture, png_file, replace};
 
 /// Compare two EXR pictures, B being the reference; prints JSON
 ///
-/// identical: the same pixels, to the bit. file_identical: the same bytes of the files, headers included.
-/// max_abs_diff, rmse: of A - B over all pixels and channels. relmse: mean of (A - B)^2 / (B^2 + 0.01).
-/// mean_ratio: mean of A / mean of B, per channel. A figure that is not finite is null.
+///   identical       the same pixels, to the bit
+///   file_identical  the same bytes of the files, headers included
+///   max_abs_diff    largest |A - B| over all pixels and channels
+///   rmse            root of the mean of (A - B)^2
+///   relmse          mean of (A - B)^2 / (B^2 + 0.01)
+///   mean_ratio      mean of A / mean of B, per channel
+///   channels        the same by channel
+/// A figure that is not finite is null.
 #[derive(Args)]
-#[command(after_help = "Exit status: 0 when the pixels are identical or every --max-... that was given holds, \
-    1 when not, 2 when the\npictures can't be compared.\n\n\
-    Examples:\n  rayherd compare a.exr b.exr\n  rayherd compare noisy.exr reference.exr --max-relmse 0.01 --diff d.png")]
+#[command(
+    verbatim_doc_comment,
+    after_help = "Exit status: 0 when the pixels are identical or every --max-... that was given holds, \
+    1 when not, 2 when the pictures can't be compared.\n\n\
+    Examples:\n  rayherd compare a.exr b.exr\n  rayherd compare noisy.exr reference.exr --max-relmse 0.01 --diff d.png"
+)]
 pub struct Arguments {
     /// The picture in question
     a: PathBuf,

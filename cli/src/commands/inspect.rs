@@ -16,8 +16,8 @@ use crate::output::{grid_picture, replace};
 /// Show what a prepared scene is made of: splits, cells, owners, copies, sizes
 #[derive(Args)]
 #[command(after_help = "The picture shows the scheduling grid layer by layer along z, from left to right and top to \
-    bottom; in a layer x grows\nto the right and y upwards. An occupied cell has the colour of its first owner, with a \
-    white corner where it has\nseveral; what is dark is empty.\n\n\
+    bottom; in a layer x grows to the right and y upwards. An occupied cell has the colour of its first owner, with \
+    a white corner where it has several; what is dark is empty.\n\n\
     Examples:\n  rayherd inspect prepared\n  rayherd inspect prepared --splits --picture grid.png")]
 pub struct Arguments {
     /// A folder that `rayherd prepare` filled

@@ -2,6 +2,7 @@
 
 mod compare;
 mod inspect;
+mod prepare;
 
 use std::io::Write;
 use std::process::ExitCode;
@@ -13,6 +14,7 @@ use clap::Subcommand;
 pub enum Command {
     Compare(compare::Arguments),
     Inspect(inspect::Arguments),
+    Prepare(prepare::Arguments),
 }
 
 /// Does it. The code is the command's answer; an error is told by the caller.
@@ -20,6 +22,7 @@ pub fn run(command: Command) -> anyhow::Result<ExitCode> {
     match command {
         Command::Compare(arguments) => compare::run(&arguments),
         Command::Inspect(arguments) => inspect::run(&arguments),
+        Command::Prepare(arguments) => prepare::run(&arguments),
     }
 }
 

@@ -1,4 +1,5 @@
 //! Running the built binary.
+#![allow(dead_code, reason = "each test file uses its own part of this")]
 
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
@@ -39,7 +40,6 @@ pub fn assert_mistake(run: &Run, parts: &[&str]) {
 }
 
 /// A file of the repository.
-#[allow(dead_code, reason = "not every test file uses the repository")]
 pub fn repository(path: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("..").join(path)
 }

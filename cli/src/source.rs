@@ -1,0 +1,83 @@
+//! From a job to its prepared scene: what `render`, `prepare` and `replay` begin with.
+
+use std::path::Path;
+use std::sync::Arc;
+
+use anyhow::Context;
+use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
+use rayherd_api::{RenderJobSpec, Strategy};
+use rayherd_scene::description::Description;
+use rayherd_scene::import::{DescriptionSource, StreamOptions, import};
+use rayherd_scene::objects::ObjectStore;
+use rayherd_scene::prepare::{Cut, PrepareProgress, PrepareSettings, Prepared, SpoolSettings, Stage, prepare};
+
+use crate::log::bars;
+use crate::options::import_options;
+
+/// Imports and prepares the scene of a job that was checked.
+pub fn open(spec: &RenderJobSpec, objects: &Arc<dyn ObjectStore>) -> anyhow::Result<(Description, Prepared)> {
+    let description = import(Path::new(&spec.scene.source), &import_options(spec))?;
+    let source = DescriptionSource::new(&description, StreamOptions::default());
+    let progress = StageBar::new();
+    let prepared =
+        prepare(&description, &source, &prepare_settings(spec), &SpoolSettings::default(), objects.as_ref(), &progress);
+    progress.finish();
+    let prepared = prepared.with_context(|| format!("cannot prepare {}", spec.scene.source))?;
+    Ok((description, prepared))
+}
+
+/// What preparing is told.
+fn prepare_settings(spec: &RenderJobSpec) -> PrepareSettings {
+    let defaults = PrepareSettings::default();
+    let cut = match (spec.block_size, spec.splits) {
+        (Some(size), _) => Cut::BlockSize(size.bytes()),
+        (None, Some(n)) => Cut::Splits(u32::try_from(n).unwrap_or(u32::MAX)),
+        (None, None) => defaults.cut,
+    };
+    let overlap_threshold = spec.overlap_threshold.unwrap_or(defaults.overlap_threshold);
+    // the paper's other two systems have none
+    let overlap_reduction = matches!(spec.strategy, Strategy::SchedulingGridOverlapReduced | Strategy::Auto);
+    PrepareSettings { cut, overlap_reduction, overlap_threshold, ..defaults }
+}
+
+/// Shows the stages of preparing on a terminal.
+struct StageBar(ProgressBar);
+
+impl StageBar {
+    fn new() -> Self {
+        let bar = ProgressBar::with_draw_target(None, ProgressDrawTarget::hidden());
+        let bar = if std::io::IsTerminal::is_terminal(&std::io::stderr()) { bars().add(bar) } else { bar };
+        StageBar(bar)
+    }
+    fn finish(&self) {
+        self.0.finish_and_clear();
+        bars().remove(&self.0);
+    }
+}
+
+impl PrepareProgress for StageBar {
+    fn begin(&self, stage: Stage, total: Option<u64>) {
+        let (what, unit) = match stage {
+            Stage::Bounds => ("reading for bounds", "records"),
+            Stage::Reading => ("reading", "records"),
+            Stage::Counting => ("counting cells", "splits"),
+            Stage::Building => ("building", "splits"),
+            Stage::Reducing => ("reducing overlap", "groups"),
+        };
+        tracing::info!("preparing: {what}");
+        let template = match total {
+            Some(_) => format!("{what} {{wide_bar:.cyan/blue}} {{human_pos}} of {{human_len}} {unit}"),
+            None => format!("{what} {{human_pos}} {unit} {{per_sec}}"),
+        };
+        if let Ok(style) = ProgressStyle::with_template(&template) {
+            self.0.set_style(style);
+        }
+        self.0.reset();
+        if let Some(total) = total {
+            self.0.set_length(total);
+        }
+    }
+    fn advance(&self, steps: u64) {
+        self.0.inc(steps);
+    }
+}
