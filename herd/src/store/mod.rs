@@ -6,6 +6,7 @@ mod directory;
 mod faulty;
 mod key;
 mod memory;
+mod objects;
 mod retrying;
 mod s3;
 #[cfg(any(test, feature = "testing"))]
@@ -18,6 +19,7 @@ pub use directory::DirectoryStore;
 pub use faulty::{FaultPlan, Faulty, Injected};
 pub use key::{check_key, check_prefix};
 pub use memory::MemoryStore;
+pub use objects::{SceneObjects, object_key};
 pub use retrying::{RetryPolicy, Retrying};
 pub use s3::{S3Credentials, S3Settings, S3Store};
 

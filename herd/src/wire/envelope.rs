@@ -17,6 +17,7 @@ const MAGIC: [u8; 4] = *b"RHRD";
 const VERSION: u8 = 1;
 const CHECKED: usize = 16;
 const HEADER: usize = 32;
+const BYTES: &str = "bytes unpacked";
 
 /// What an envelope holds.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
@@ -60,11 +61,13 @@ pub enum WireError {
         expected: Kind,
     },
     /// Whole, but larger than the reader allows.
-    #[error("{length} bytes unpacked, the limit is {limit}")]
+    #[error("{count} {what}, the limit is {limit}")]
     TooLarge {
-        /// Size of the payload, bytes.
-        length: u64,
-        /// What the reader allows, bytes.
+        /// Of what.
+        what: &'static str,
+        /// How many there are.
+        count: u64,
+        /// How many the reader allows.
         limit: u64,
     },
 }
@@ -120,7 +123,7 @@ pub fn open(kind: Kind, bytes: &[u8], limit: usize) -> Result<Vec<u8>, WireError
     }
     let length = u64::from_le_bytes(std::array::from_fn(|i| bytes[8 + i]));
     if length > limit as u64 {
-        return Err(WireError::TooLarge { length, limit: limit as u64 });
+        return Err(WireError::TooLarge { what: BYTES, count: length, limit: limit as u64 });
     }
     // at most `limit`, which is a usize
     let length = length as usize;
@@ -208,7 +211,7 @@ mod tests {
     #[test]
     fn names_what_is_wrong() {
         let sealed = seal(Kind::RayGroup, &[7; 100], Compress::Lz4).to_vec();
-        assert_eq!(open(Kind::RayGroup, &sealed, 99), Err(WireError::TooLarge { length: 100, limit: 99 }));
+        assert_eq!(open(Kind::RayGroup, &sealed, 99), Err(WireError::TooLarge { what: BYTES, count: 100, limit: 99 }));
         assert_eq!(open(Kind::FilmPart, &sealed, 100), Err(WireError::Kind { found: 1, expected: Kind::FilmPart }));
         let newer = resealed(sealed.clone(), |b| b[4] = 9);
         assert_eq!(open(Kind::RayGroup, &newer, 100), Err(WireError::Version { found: 9 }));
