@@ -73,8 +73,8 @@ pub(super) enum Record {
     Leaf(usize, usize),
 }
 
-/// Checks all of a geometry object. `visit` is called for each record once it was found to be right; what it does is
-/// void when an error is returned.
+/// Checks all of a geometry object. `visit` is called for each record in the order of the bytes, once it was found to lie
+/// within the arena; what it does is void when an error is returned in the end.
 ///
 /// Takes memory of a small multiple of `bytes.len()` at most.
 pub(super) fn check<'a>(bytes: &'a [u8], visit: &mut dyn FnMut(Record)) -> Result<Checked<'a>, BlockError> {

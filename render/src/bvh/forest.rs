@@ -309,8 +309,9 @@ impl Forest {
                     let place = n + NODE_REFS + slot * 4;
                     let reference = read_u32(source, place);
                     if reference != 0 {
-                        // at most 2^28 in the sum, as the room is below MAX_ARENA: leaf bits stay as they are
-                        write_u32(out, place, reference + node_ref(base));
+                        // the sum of offsets is below 2^28, as the room is below MAX_ARENA, so leaf bits stay as they are;
+                        // wrapping, since a reference is checked only when the pass comes to what it leads to
+                        write_u32(out, place, reference.wrapping_add(node_ref(base)));
                     }
                 }
             }

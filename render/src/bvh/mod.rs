@@ -10,6 +10,7 @@ mod collapse;
 pub mod forest;
 mod ids;
 mod layout;
+mod order;
 mod regions;
 mod sah;
 mod top;

@@ -13,6 +13,7 @@ pub(super) use scalar::read_triangle;
 use setup::State;
 
 use super::forest::Forest;
+use super::order::Sorter;
 use crate::ray::{Hit, MISS, Ray};
 
 /// Which code traces. All give the same bits.
@@ -50,6 +51,7 @@ pub struct Tracer {
     kernel: Kernel,
     counters: Counters,
     stack: scalar::Stack,
+    sorter: Option<Sorter>,
     #[cfg(target_arch = "x86_64")]
     lanes: wide::Lanes,
 }
@@ -69,6 +71,7 @@ impl Tracer {
             kernel,
             counters: Counters::default(),
             stack: Vec::new(),
+            sorter: None,
             #[cfg(target_arch = "x86_64")]
             lanes: wide::Lanes::default(),
         })
@@ -77,6 +80,11 @@ impl Tracer {
     /// The kernel that runs; never [`Kernel::Auto`].
     pub fn kernel(&self) -> Kernel {
         self.kernel
+    }
+    /// Whether vector kernels trace batches in the order of the rays' origins; at first they don't. Changes no answer. Worth
+    /// it for scrambled batches in large forests only: see `bvh/order.rs`.
+    pub fn set_sorting(&mut self, is_on: bool) {
+        self.sorter = is_on.then(Sorter::default);
     }
     /// Sums since the tracer was made.
     pub fn counters(&self) -> Counters {
@@ -113,9 +121,16 @@ impl Tracer {
     /// Traces and tells `done` each ray's number and final state.
     fn run<const ANY: bool>(&mut self, forest: &Forest, rays: &[Ray], done: &mut impl FnMut(usize, &State)) {
         assert!(forest.is_finished(), "a forest is traced after finish()");
+        self.counters.rays += rays.len() as u64;
+        // numbers of rays in flight are of 32 bits
+        for (i, part) in rays.chunks(MAX_BATCH).enumerate() {
+            self.run_part::<ANY>(forest, part, &mut |k, state| done(i * MAX_BATCH + k, state));
+        }
+    }
+
+    fn run_part<const ANY: bool>(&mut self, forest: &Forest, rays: &[Ray], done: &mut impl FnMut(usize, &State)) {
         let Tracer { kernel, counters, stack, .. } = self;
         let mut of_spheres = Counters::default();
-        counters.rays += rays.len() as u64;
         // triangles first, then the spheres that are nearer
         let spheres = forest.sphere_root();
         let mut finish = |i: usize, state: &mut State, stack: &mut scalar::Stack| {
@@ -129,8 +144,12 @@ impl Tracer {
         match kernel {
             #[cfg(target_arch = "x86_64")]
             Kernel::Avx2 | Kernel::Avx512 => {
+                let order = match (&mut self.sorter, forest.bounds()) {
+                    (Some(sorter), Some(bounds)) => sorter.order(bounds, rays),
+                    _ => &[],
+                };
                 let mut finish = |i: usize, state: &mut State| finish(i, state, stack);
-                wide::trace::<ANY>(*kernel, &mut self.lanes, forest, rays, &[], &mut finish, counters);
+                wide::trace::<ANY>(*kernel, &mut self.lanes, forest, rays, order, &mut finish, counters);
             }
             _ => {
                 for (i, ray) in rays.iter().enumerate() {
@@ -144,6 +163,9 @@ impl Tracer {
         counters.leaves += of_spheres.leaves;
     }
 }
+
+/// Rays that are traced as one batch.
+const MAX_BATCH: usize = 1 << 24;
 
 /// Whether this processor can run a kernel.
 fn runs(kernel: Kernel) -> bool {
