@@ -4,7 +4,7 @@
 //! shows all of it: no record overlaps another, references go forward and form a tree, every primitive of the block
 //! stands in exactly one leaf, every box is finite and contains what is below it.
 
-use super::block::{HEADER, MAGIC, MAX_PRIMITIVES, NO_ROOT, VERSION};
+use super::block::{HEADER, MAGIC, MAX_PRIMITIVES, NO_ROOT, Sphere, VERSION, read_sphere};
 use super::ids::Ids;
 use super::layout::*;
 
@@ -235,30 +235,35 @@ impl Pass<'_, '_> {
         if at > self.arena.len() || self.arena.len() - at < leaf_bytes(n) {
             return fail("a leaf passes the end");
         }
-        let mut previous = None;
-        for i in 0..n {
-            let row = |r: usize| read_f32(self.arena, at + (r * n + i) * 4);
-            let content = if kind.is_triangle {
-                let t: [[f32; 3]; 3] = std::array::from_fn(|v| std::array::from_fn(|c| row(v * 3 + c)));
-                if t.as_flattened().iter().any(|x| x.is_nan()) {
-                    return fail("a coordinate is not a number");
-                }
-                Aabb::of_triangle(&t)
-            } else {
-                let radius = row(3);
-                if !(radius > 0.0 && radius <= MAX_COORDINATE) || row(4).to_bits() > 1 {
-                    return fail("a sphere has a wrong radius or flag");
-                }
-                if (5..INDEX_ROW).any(|r| row(r).to_bits() != 0) {
-                    return fail("a reserved field is set");
-                }
-                Aabb::of_sphere([row(0), row(1), row(2)], radius)
+        let row = |r: usize| self.arena[at + r * n * 4..][..n * 4].chunks_exact(4).map(|x| read_u32(x, 0));
+        if kind.is_triangle {
+            // false for NaN as well
+            let within = |axis: usize, bits: u32| {
+                let x = f32::from_bits(bits);
+                aabb.lo[axis] <= x && x <= aabb.hi[axis]
             };
-            // false for NaN as well: of_sphere passes it on
-            if !aabb.contains(&content) {
+            if !(0..INDEX_ROW).all(|r| row(r).fold(true, |all, x| all & within(r % 3, x))) {
                 return fail("a box does not contain its primitives");
             }
-            let index = row(INDEX_ROW).to_bits();
+        } else {
+            if row(3).any(|x| !(f32::from_bits(x) > 0.0 && f32::from_bits(x) <= MAX_COORDINATE))
+                || row(4).any(|x| x > 1)
+            {
+                return fail("a sphere has a wrong radius or flag");
+            }
+            if (5..INDEX_ROW).any(|r| row(r).any(|x| x != 0)) {
+                return fail("a reserved field is set");
+            }
+            for i in 0..n {
+                let Sphere { center, radius, .. } = read_sphere(self.arena, at, n, i);
+                // false for NaN as well: of_sphere passes it on
+                if !aabb.contains(&Aabb::of_sphere(center, radius)) {
+                    return fail("a box does not contain its primitives");
+                }
+            }
+        }
+        let mut previous = None;
+        for index in row(INDEX_ROW) {
             if index < kind.first || index >= kind.end || previous.is_some_and(|p| p >= index) {
                 return fail("the index of a primitive is out of range or order");
             }

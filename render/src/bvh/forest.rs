@@ -1,7 +1,7 @@
 //! The splits that are resident in one task, in one arena under one top tree.
 
 use super::arena::Arena;
-use super::block::{HEADER, Sphere, sizes};
+use super::block::{HEADER, Sphere, read_sphere, sizes};
 use super::check::{BlockError, Record, Tree, check};
 use super::ids::Ids;
 use super::layout::*;
@@ -382,10 +382,4 @@ impl Forest {
             self.room.give(at, bytes);
         }
     }
-}
-
-/// The i-th sphere of a leaf of n.
-pub(super) fn read_sphere(arena: &[u8], leaf: usize, n: usize, i: usize) -> Sphere {
-    let row = |r: usize| read_f32(arena, leaf + (r * n + i) * 4);
-    Sphere { center: [row(0), row(1), row(2)], radius: row(3), flipped: row(4).to_bits() != 0 }
 }

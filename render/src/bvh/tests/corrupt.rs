@@ -77,7 +77,7 @@ fn each_kind_of_damage_is_named() {
     let index = at + INDEX_ROW * n * 4;
     says(with(&|o| write_u32(o, index, 150)), "out of range or order");
     says(with(&|o| write_u32(o, index, read_u32(&good, index + 4))), "out of range or order");
-    says(with(&|o| write_f32(o, at, f32::NAN)), "not a number");
+    says(with(&|o| write_f32(o, at, f32::NAN)), "does not contain its primitives");
     says(with(&|o| write_f32(o, at, 5.0)), "does not contain its primitives");
     let other = read_u32(&good, index);
     let free = (0..150).find(|&i| i < other && i != other).unwrap();

@@ -1,7 +1,8 @@
 //! The plain kernel: one ray, one box, one primitive at a time. The vector kernels give its answers to the bit.
 //! Spheres are traced by it always: scenes have few.
 
-use super::super::forest::{Forest, read_sphere};
+use super::super::block::read_sphere;
+use super::super::forest::Forest;
 use super::super::layout::*;
 use super::setup::State;
 use super::triangle::{Intersection, intersect};
