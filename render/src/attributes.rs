@@ -116,3 +116,57 @@ impl AttributeBlock {
         })
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::testing::Rng;
+
+    fn block(n: usize, normals: bool, uvs: bool) -> AttributeBlock {
+        let mut rng = Rng(1);
+        AttributeBlock {
+            shapes: (0..n).map(|i| [3, 3, 7, 9][i * 4 / n.max(1)]).collect(),
+            normals: if normals { (0..n).map(|_| [rng.direction().to_array(); 3]).collect() } else { Vec::new() },
+            uvs: if uvs { (0..n).map(|_| [[rng.f32(), rng.f32()]; 3]).collect() } else { Vec::new() },
+        }
+    }
+
+    #[test]
+    fn bytes_come_back() {
+        for n in [0, 1, 1000] {
+            for (normals, uvs) in [(false, false), (true, false), (false, true), (true, true)] {
+                let block = block(n, normals, uvs);
+                assert_eq!(AttributeBlock::decode(&block.encode(), n as u32), Ok(block));
+            }
+        }
+        // one run for equal neighbours
+        assert_eq!(block(1000, false, false).encode().len(), 16 + 3 * 8);
+    }
+
+    #[test]
+    fn bad_bytes_are_refused() {
+        let good = block(20, true, true).encode();
+        for n in 0..good.len() {
+            assert!(AttributeBlock::decode(&good[..n], 20).is_err());
+        }
+        assert!(AttributeBlock::decode(&good, 21).is_err());
+        let mut rng = Rng(2);
+        let mut refused = 0;
+        for _ in 0..20_000 {
+            let mut bad = good.clone();
+            let i = rng.u32() as usize % 48;
+            bad[i] = rng.u32() as u8;
+            match AttributeBlock::decode(&bad, 20) {
+                Ok(block) => assert_eq!(block.shapes.len(), 20),
+                Err(_) => refused += 1,
+            }
+        }
+        assert!(refused > 5000, "{refused}");
+        // a header that asks for the most: refused before memory is taken
+        let mut huge = good[..16].to_vec();
+        huge[4..16].fill(0xff);
+        huge[4] = 3;
+        huge[5..8].fill(0);
+        assert!(matches!(AttributeBlock::decode(&huge, u32::MAX), Err(AttributeError::Length { .. })));
+    }
+}

@@ -61,3 +61,47 @@ impl Camera {
         d.map(|c| (c * scale) as f32)
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A camera at (5, 6, 7) that looks along +z: +x of the world is at the left of the picture, +y at the top.
+    #[test]
+    fn orientation_is_mitsubas() {
+        let rows = [[1.0, 0.0, 0.0, 5.0], [0.0, 1.0, 0.0, 6.0], [0.0, 0.0, 1.0, 7.0]];
+        let camera = Camera::new(&rows, 90.0, [200, 100], [1.0, 2.0, 3.0]).unwrap();
+        assert_eq!(camera.origin, [4.0; 3]);
+        let close = |d: [f32; 3], e: [f64; 3]| {
+            let l = (e[0] * e[0] + e[1] * e[1] + e[2] * e[2]).sqrt();
+            assert!((0..3).all(|i| (f64::from(d[i]) - e[i] / l).abs() < 1e-7), "{d:?} {e:?}");
+        };
+        close(camera.direction(100.0, 50.0), [0.0, 0.0, 1.0]);
+        // the field of view is along x; y has half of it
+        close(camera.direction(0.0, 50.0), [1.0, 0.0, 1.0]);
+        close(camera.direction(200.0, 50.0), [-1.0, 0.0, 1.0]);
+        close(camera.direction(100.0, 0.0), [0.0, 0.5, 1.0]);
+        close(camera.direction(0.0, 100.0), [1.0, -0.5, 1.0]);
+    }
+
+    /// Far from the origin the camera keeps its place to f32 of the recentred coordinates.
+    #[test]
+    fn recentring_is_exact() {
+        let rows = [[1.0, 0.0, 0.0, 4_000_000.25], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]];
+        let camera = Camera::new(&rows, 45.0, [1, 1], [4_000_000.0, 0.0, 0.0]).unwrap();
+        assert_eq!(camera.origin, [0.25, 0.0, 0.0]);
+    }
+
+    #[test]
+    fn bad_cameras_are_refused() {
+        let good = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]];
+        for fov in [0.0, 180.0, -1.0, f64::NAN] {
+            assert!(matches!(Camera::new(&good, fov, [1, 1], [0.0; 3]), Err(CameraError::FieldOfView(_))));
+        }
+        for bad in [0.0, f64::NAN, f64::INFINITY] {
+            let mut rows = good;
+            rows[1][1] = bad;
+            assert!(matches!(Camera::new(&rows, 45.0, [1, 1], [0.0; 3]), Err(CameraError::Singular)));
+        }
+    }
+}

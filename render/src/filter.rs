@@ -87,3 +87,50 @@ fn normal_quantile(p: f64) -> f64 {
     }
     if p < 0.5 { -x } else { x }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// The offsets are the quantiles of the density, which integrates to 1: the integral up to the offset of a number u is u.
+    #[test]
+    fn offsets_are_quantiles() {
+        for filter in
+            [Filter::Box, Filter::Tent { radius: 1.0 }, Filter::Tent { radius: 2.5 }, Filter::Gaussian { stddev: 0.5 }]
+        {
+            let mut integral = 0.0;
+            let mut at: f64 = -5.0;
+            let step: f64 = 1.0 / 4096.0;
+            for i in 0..200u64 {
+                let bits = (i * 0x0147_ae14 + 1000) as u32;
+                let u = (f64::from(bits) + 0.5) / 4_294_967_296.0;
+                let x = filter.offset(bits);
+                // midpoints from where the last one ended
+                while at < x {
+                    let h = step.min(x - at);
+                    integral += h * filter.density(at + 0.5 * h);
+                    at += h;
+                }
+                assert!((integral - u).abs() < 2e-4, "{filter:?}: {integral} up to {x}, not {u}");
+            }
+            while at < 5.0 {
+                integral += step * filter.density(at + 0.5 * step);
+                at += step;
+            }
+            assert!((integral - 1.0).abs() < 2e-4, "{filter:?}: {integral}");
+        }
+    }
+
+    #[test]
+    fn quantiles_are_exact() {
+        for i in 1..1000 {
+            let u = f64::from(i) / 1000.0;
+            let x = truncated_normal(u);
+            let cdf = |x: f64| 0.5 * libm::erfc(-x * std::f64::consts::FRAC_1_SQRT_2);
+            let found = (cdf(x) - cdf(-CUT)) / (cdf(CUT) - cdf(-CUT));
+            assert!((found - u).abs() < 1e-12, "{u}: {found}");
+        }
+        let ends = [Filter::Gaussian { stddev: 1.0 }.offset(0), Filter::Gaussian { stddev: 1.0 }.offset(u32::MAX)];
+        assert!(ends[0] >= -4.0 && ends[0] < -3.9 && ends[1] <= 4.0 && ends[1] > 3.9, "{ends:?}");
+    }
+}

@@ -18,4 +18,6 @@ pub mod math;
 pub mod path;
 pub mod ray;
 pub mod sampler;
+#[cfg(test)]
+mod testing;
 pub mod world;

@@ -1,1 +1,223 @@
-//! Tests.
+use super::*;
+use crate::testing::Rng;
+
+const SIZE: [u32; 2] = [70, 45];
+
+fn random_adds(seed: u64, n: usize) -> Vec<(u32, u32, [f32; 3])> {
+    let mut rng = Rng(seed);
+    (0..n)
+        .map(|_| {
+            let scale = 2.0f32.powi((rng.u32() % 60) as i32 - 40);
+            let pixel = rng.u32() % (SIZE[0] * SIZE[1]);
+            (pixel, rng.u32() % 16, std::array::from_fn(|_| rng.f32() * scale))
+        })
+        .collect()
+}
+
+fn filled(adds: &[(u32, u32, [f32; 3])]) -> FilmPart {
+    let mut film = FilmPart::new(SIZE);
+    for &(pixel, sample, value) in adds {
+        film.add(pixel, sample, value);
+    }
+    film
+}
+
+/// Against plain sums in f64, which round but not much.
+#[test]
+fn sums_are_the_plain_twins() {
+    let adds = random_adds(1, 50_000);
+    let film = filled(&adds);
+    let mut twin = vec![[0.0f64; 3]; (SIZE[0] * SIZE[1]) as usize];
+    for &(pixel, _, value) in &adds {
+        for c in 0..3 {
+            twin[pixel as usize][c] += f64::from(value[c]);
+        }
+    }
+    for (a, b) in film.resolve(7).iter().zip(&twin) {
+        for c in 0..3 {
+            let b = b[c] / 7.0;
+            assert!((f64::from(a[c]) - b).abs() <= b * 6.1e-8 + 1e-15, "{} {b}", a[c]);
+        }
+    }
+}
+
+#[test]
+fn order_and_parts_do_not_matter() {
+    let mut adds = random_adds(2, 20_000);
+    adds.push((5, 3, [f32::NAN, 0.0, 0.0]));
+    adds.push((6, 3, [0.0, f32::INFINITY, 0.0]));
+    adds.push((7, 3, [0.0, 0.0, -1.0]));
+    adds.push((8, 3, [LIMIT, 0.0, 0.0]));
+    let whole = filled(&adds);
+    assert_eq!(whole.rejected().count, 4);
+    assert_eq!(whole.rejected().keys.iter().copied().collect::<Vec<_>>(), [(5, 3), (6, 3), (7, 3), (8, 3)]);
+    let mut rng = Rng(3);
+    let mut parts = vec![FilmPart::new(SIZE); 5];
+    let mut shuffled = adds.clone();
+    for i in (1..shuffled.len()).rev() {
+        shuffled.swap(i, rng.u32() as usize % (i + 1));
+    }
+    for &(pixel, sample, value) in &shuffled {
+        parts[rng.u32() as usize % 5].add(pixel, sample, value);
+    }
+    let mut merged = FilmPart::new(SIZE);
+    for part in parts.iter().rev() {
+        merged.merge(part).unwrap();
+    }
+    assert_eq!(merged, whole);
+    assert_eq!(merged.encode(), whole.encode());
+    assert!(merged.merge(&FilmPart::new([1, 1])).is_err());
+}
+
+#[test]
+fn kept_keys_are_the_smallest() {
+    let mut film = FilmPart::new(SIZE);
+    for i in (0..100).rev() {
+        film.add(i, 1, [f32::NAN; 3]);
+    }
+    assert_eq!(film.rejected().count, 100);
+    assert!(film.rejected().keys.iter().copied().eq((0..KEPT_KEYS as u32).map(|i| (i, 1))));
+    assert_eq!(film.touched(), 0);
+}
+
+#[test]
+fn floats_become_fixed_exactly() {
+    let cases: [(f32, i128); 8] = [
+        (0.0, 0),
+        (-0.0, 0),
+        (1.0, 1 << 64),
+        (1.5, 3 << 63),
+        (5.421_011e-20, 1), // 2^-64
+        (2.710_505_4e-20, 0),
+        (f32::MIN_POSITIVE / 2.0, 0),
+        (137_438_953_472.0, 1 << 101),
+    ];
+    for (x, expected) in cases {
+        assert_eq!(fixed(x), expected, "{x}");
+    }
+    let mut rng = Rng(4);
+    for _ in 0..100_000 {
+        let x = f32::from_bits(rng.u32() & 0x7fff_ffff);
+        if x < LIMIT {
+            // in f64 the scaling is exact and so is cutting off, below 2^53; above, the float is an integer
+            let wide = f64::from(x) * 18_446_744_073_709_551_616.0;
+            assert_eq!(fixed(x), wide as i128, "{x}");
+        }
+    }
+}
+
+#[test]
+fn bytes_come_back() {
+    for n in [0, 1, 100, 20_000] {
+        let mut film = filled(&random_adds(5, n));
+        film.add(3, 1, [f32::NAN; 3]);
+        let bytes = film.encode();
+        assert_eq!(FilmPart::decode(&bytes, SIZE).unwrap(), film);
+        println!("{n} adds: {} bytes, {} in memory", bytes.len(), film.memory());
+        assert!(bytes.len() < 33 + 9 + film.touched() * 132 + n * 3 * 17);
+    }
+    // also negative sums, which a merge of wrapped sums could hold
+    let mut film = FilmPart::new([1, 1]);
+    film.tiles[0] = Some(Tile::new());
+    let values = [i128::MIN, i128::MAX, -1, 255 << 64, -256, 0x80];
+    film.tiles[0].as_mut().unwrap().0[0].as_flattened_mut().copy_from_slice(&values);
+    assert_eq!(FilmPart::decode(&film.encode(), [1, 1]).unwrap(), film);
+}
+
+/// Whatever was changed, decoding answers; what it accepts is a film of the size.
+#[test]
+fn bad_bytes_are_refused() {
+    let good = filled(&random_adds(6, 300)).encode();
+    for n in 0..good.len().min(2000) {
+        assert!(FilmPart::decode(&good[..n], SIZE).is_err());
+    }
+    let mut rng = Rng(7);
+    let mut refused = 0;
+    for _ in 0..3000 {
+        let mut bad = good.clone();
+        for _ in 0..1 + rng.u32() % 4 {
+            let i = rng.u32() as usize % if rng.u32() & 1 == 0 { bad.len() } else { 400 };
+            bad[i] = rng.u32() as u8;
+        }
+        match FilmPart::decode(&bad, SIZE) {
+            Ok(film) => assert_eq!(film.size(), SIZE),
+            Err(_) => refused += 1,
+        }
+    }
+    assert!(refused > 500, "{refused}");
+    assert_eq!(FilmPart::decode(b"nothing", SIZE), Err(FilmError::Magic));
+    let mut long = good;
+    long.push(0);
+    assert!(matches!(FilmPart::decode(&long, SIZE), Err(FilmError::Corrupt(_))));
+}
+
+/// The quotient is the float nearest to sum / (n 2^64): no other float is nearer, and ties go to even.
+#[test]
+fn division_rounds_once() {
+    let mut rng = Rng(8);
+    for i in 0..200_000 {
+        let n = if i % 3 == 0 { 1 << (rng.u32() % 25) } else { 1 + rng.u32() % (1 << 24) };
+        let mut sum = (u128::from(rng.u64()) << 64 | u128::from(rng.u64())) >> (1 + rng.u32() % 120);
+        if i % 5 == 0 {
+            // near the middle between two floats
+            let float = f32::from_bits((60 + rng.u32() % 60) << 23 | rng.u32() >> 9);
+            let next = f32::from_bits(float.to_bits() + 1);
+            sum = ((fixed(float) + fixed(next)) / 2 * i128::from(n)) as u128 + u128::from(rng.u32() % 3);
+            sum = sum.saturating_sub(1);
+        }
+        let sum = sum as i128;
+        let mut film = FilmPart::new([1, 1]);
+        film.tiles[0] = Some(Tile::new());
+        film.tiles[0].as_mut().unwrap().0[0][1][2] = sum;
+        let q = film.resolve(n)[0][2];
+        // distances to q and its neighbours, times n 2^88: all integers when the float is not below 2^-64
+        let distance = |x: f32| -> Option<u128> {
+            let wide = f64::from(x) * 2.0f64.powi(88);
+            if wide.fract() != 0.0 || wide > 1e27 {
+                return None;
+            }
+            let a = (wide as i128).checked_mul(i128::from(n))?;
+            Some(a.abs_diff(sum.checked_mul(1 << 24)?))
+        };
+        if q > 0.0
+            && let (Some(d), Some(up), Some(down)) = (distance(q), distance(q.next_up()), distance(q.next_down()))
+        {
+            assert!(d <= up && d <= down, "{sum} / {n}: {q}");
+            if d == up || d == down {
+                assert_eq!(q.to_bits() & 1, 0, "{sum} / {n}: a tie to odd");
+            }
+        }
+    }
+}
+
+/// The estimate from the halves against the true error, for noise small enough that the mean in the denominator is near the
+/// truth; equal and unequal halves.
+#[test]
+fn error_estimate_is_the_error() {
+    let size = [64, 64];
+    for samples in [2, 3, 8, 9] {
+        let mut film = FilmPart::new(size);
+        let mut rng = Rng(9);
+        let mut truth = 0.0;
+        for pixel in 0..size[0] * size[1] {
+            let mean = 0.05 + f64::from(pixel % 64) / 32.0;
+            let mut sum = 0.0;
+            for s in 0..samples {
+                let x = (mean * (0.7 + 0.6 * rng.f64())) as f32;
+                film.add(pixel, s, [x; 3]);
+                sum += f64::from(x);
+            }
+            let m = sum / f64::from(samples);
+            truth += (m - mean) * (m - mean) / (mean * mean + 0.01);
+        }
+        truth /= f64::from(size[0] * size[1]);
+        let estimate = film.rel_mse(samples).unwrap();
+        let map = film.rel_mse_map(samples).unwrap();
+        let mean = map.iter().map(|&x| f64::from(x)).sum::<f64>() / map.len() as f64;
+        println!("{samples}: {estimate} {truth}");
+        assert!((mean / estimate - 1.0).abs() < 1e-4);
+        assert!((estimate / truth - 1.0).abs() < 0.15, "{samples}: {estimate} {truth}");
+    }
+    assert_eq!(FilmPart::new(size).rel_mse(1), None);
+    assert_eq!(FilmPart::new(size).rel_mse(2), Some(0.0));
+}

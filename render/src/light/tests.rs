@@ -1,1 +1,233 @@
-//! Tests.
+use glam::Vec3;
+
+use super::*;
+use crate::material::{Bsdf, Material};
+use crate::math::{UnitDir, unit};
+use crate::sampler::Stream;
+use crate::testing::{Rng, chi_square, integrate_bins, sphere_bin};
+use crate::world::{EmissivePrimitive, ShapeInfo};
+
+/// A world of emissive primitives, each of the shape and the radiance given.
+fn world(primitives: &[(Primitive, u32)], radiances: &[f32], environment: Option<[f32; 3]>) -> World {
+    World {
+        materials: vec![Material {
+            name: String::new(),
+            bsdf: Bsdf::Diffuse { reflectance: [0.5; 3] },
+            two_sided: true,
+        }],
+        shapes: radiances
+            .iter()
+            .map(|&r| ShapeInfo { name: String::new(), material: 0, emission: Some([r; 3]) })
+            .collect(),
+        emissive: primitives
+            .iter()
+            .enumerate()
+            .map(|(i, &(geometry, shape))| EmissivePrimitive { prim: 10 + 3 * i as u64, shape, geometry })
+            .collect(),
+        environment,
+        lo: [-2.0; 3],
+        hi: [2.0; 3],
+    }
+}
+
+fn mixed() -> Vec<(Primitive, u32)> {
+    vec![
+        (Primitive::Triangle([[-1.0, 2.0, -1.0], [1.0, 2.0, -1.0], [0.0, 2.0, 1.5]]), 0),
+        (Primitive::Triangle([[2.0, 0.0, 0.0], [2.0, 0.0, 1.0], [2.0, 1.0, 0.0]]), 1),
+        (Primitive::Sphere { center: [-1.5, 0.5, 0.5], radius: 0.4, flipped: false }, 2),
+        (Primitive::Sphere { center: [0.0, 0.0, 0.0], radius: 5.0, flipped: true }, 3),
+    ]
+}
+
+/// In f64: where the ray meets the fronts, the density that `Lights` says, summed over all of them.
+fn density(lights: &Lights, primitives: &[(Primitive, u32)], o: Vec3, d: Vec3) -> f64 {
+    let mut sum = 0.0;
+    let (o, d) = (o.as_dvec3(), d.as_dvec3());
+    for (i, (geometry, _)) in primitives.iter().enumerate() {
+        let mut meet = |t: f64, cos: f64| {
+            if t > 0.0 && cos > 0.0 {
+                sum += f64::from(lights.pdf(10 + 3 * i as u64, o.as_vec3(), t as f32, cos as f32));
+            }
+        };
+        match geometry {
+            Primitive::Triangle(v) => {
+                let [a, b, c] = v.map(|p| Vec3::from(p).as_dvec3());
+                let n = (b - a).cross(c - a);
+                let t = (a - o).dot(n) / d.dot(n);
+                let p = o + d * t;
+                let inside = [(a, b), (b, c), (c, a)].iter().all(|(p0, p1)| (*p1 - *p0).cross(p - *p0).dot(n) >= 0.0);
+                if inside {
+                    meet(t, -d.dot(n) / n.length());
+                }
+            }
+            Primitive::Sphere { center, radius, flipped } => {
+                let f = o - Vec3::from(*center).as_dvec3();
+                let r = f64::from(*radius);
+                let (b, c) = (f.dot(d), f.length_squared() - r * r);
+                let disc = b * b - c;
+                if disc > 0.0 {
+                    for t in [-b - disc.sqrt(), -b + disc.sqrt()] {
+                        let n = (f + d * t) / r * if *flipped { -1.0 } else { 1.0 };
+                        meet(t, -d.dot(n));
+                    }
+                }
+            }
+        }
+    }
+    sum + f64::from(lights.sky_pdf())
+}
+
+/// Directions, after snapping, are distributed as the density, which the other side of MIS uses.
+#[test]
+fn samples_follow_the_density() {
+    for (sky, seed) in [(None, 1), (Some([0.1; 3]), 2)] {
+        let primitives = mixed();
+        let lights = Lights::new(&world(&primitives, &[3.0, 10.0, 5.0, 0.05], sky));
+        for o in [Vec3::new(0.1, -0.3, 0.2), Vec3::new(1.0, 1.0, -1.0)] {
+            let bins = 20;
+            let mut counts = vec![0.0; 2 * bins * bins];
+            let n = 400_000;
+            let mut outside = 0.0;
+            let mut rng = Rng(seed);
+            for _ in 0..n {
+                match lights.sample(o, rng.u32(), [rng.f32(), rng.f32()]) {
+                    Some(s) => {
+                        let d = Vec3::from(UnitDir::encode(s.d.to_array()).decode());
+                        counts[sphere_bin(d, bins)] += 1.0;
+                    }
+                    None => outside += 1.0,
+                }
+            }
+            let mut expected = integrate_bins(bins, 40, |d| density(&lights, &primitives, o, d));
+            println!("{outside} from behind; sum {}", expected.iter().sum::<f64>());
+            expected.iter_mut().for_each(|e| *e *= f64::from(n));
+            // quadrature at the edges of sources is good to a few parts in a thousand of a bin: pooled to larger ones
+            let pool = |x: &[f64]| x.chunks(bins / 2).map(|c| c.iter().sum()).collect::<Vec<f64>>();
+            let unseen = f64::from(n) - expected.iter().sum::<f64>();
+            assert!((outside - unseen).abs() < 0.002 * f64::from(n), "{outside} {unseen}");
+            for (o, e) in pool(&counts).iter().zip(&pool(&expected)) {
+                assert!((o - e).abs() < 5.0 * e.max(1.0).sqrt() + 0.004 * e, "{o} {e}");
+            }
+        }
+    }
+}
+
+/// What a sample says of its density is what a hit there is told.
+#[test]
+fn both_sides_agree() {
+    let primitives = mixed();
+    let lights = Lights::new(&world(&primitives, &[3.0, 10.0, 5.0, 0.05], Some([0.2; 3])));
+    let mut rng = Rng(4);
+    let mut found = 0;
+    for _ in 0..100_000 {
+        let o = rng.vec3(1.9);
+        let choice = rng.u32();
+        let Some(s) = lights.sample(o, choice, [rng.f32(), rng.f32()]) else { continue };
+        assert!((s.d.length() - 1.0).abs() < 1e-6 && s.pdf > 0.0 && s.pdf.is_finite() && s.tmax >= 0.0);
+        let i = lights.choose(choice).unwrap();
+        if i >= primitives.len() {
+            assert!((s.pdf / lights.sky_pdf() - 1.0).abs() < 1e-6 && s.tmax == f32::INFINITY);
+            continue;
+        }
+        let alone = density(&lights, &primitives, o, s.d) - f64::from(lights.sky_pdf());
+        // other sources may lie in the same direction, and at a rim rounding decides
+        if alone < f64::from(s.pdf) * 0.99 {
+            continue;
+        }
+        found += 1;
+    }
+    assert!(found > 60_000, "{found}");
+}
+
+/// The density, found by the geometry of the ray that goes to the sample, equals the sample's to rounding.
+#[test]
+fn triangle_density_is_exact() {
+    let v = [[-1.0, 2.0, -1.0], [1.0, 2.0, -1.0], [0.0, 2.0, 1.5]];
+    let primitives = [(Primitive::Triangle(v), 0)];
+    let lights = Lights::new(&world(&primitives, &[1.0], None));
+    let mut rng = Rng(5);
+    for _ in 0..10_000 {
+        let o = Vec3::new(rng.range(-3.0, 3.0), rng.range(-3.0, 1.9), rng.range(-3.0, 3.0));
+        let Some(s) = lights.sample(o, rng.u32(), [rng.f32(), rng.f32()]) else { continue };
+        let t = (2.0 - o.y) / s.d.y;
+        let pdf = lights.pdf(10, o, t, s.d.y);
+        assert!((s.pdf / pdf - 1.0).abs() < 1e-5, "{} {pdf}", s.pdf);
+        // the limit is short of the light, by little
+        assert!(s.tmax < t && s.tmax > t * (1.0 - 1e-3 / s.d.y), "{} {t}", s.tmax);
+    }
+}
+
+/// Shares: nine tenths by power, a tenth evenly; within a shape by area; behind the light nothing.
+#[test]
+fn choice_is_by_power() {
+    let right = |x: f32, s: f32| Primitive::Triangle([[x, 2.0, 0.0], [x + s, 2.0, 0.0], [x, 2.0, s]]);
+    // shape 0: areas 0.5 and 2; shape 1: area 0.5 and twice the radiance
+    let primitives = [(right(0.0, 1.0), 0), (right(2.0, 2.0), 0), (right(5.0, 1.0), 1)];
+    let lights = Lights::new(&world(&primitives, &[1.0, 2.0], None));
+    let power = [2.5, 1.0];
+    let share = |s: usize| 0.9 * power[s] / 3.5 + 0.1 / 2.0;
+    let expected = [share(0) * 0.2, share(0) * 0.8, share(1)];
+    let n = 100_000u32;
+    let mut counts = [0.0; 3];
+    for i in 0..n {
+        counts[lights.choose((u64::from(i) * (1 << 32) / u64::from(n)) as u32).unwrap()] += 1.0;
+    }
+    for i in 0..3 {
+        assert!((counts[i] / f64::from(n) - expected[i]).abs() < 2e-5, "{counts:?} {expected:?}");
+        assert!((f64::from(lights.sources[i].probability) - expected[i]).abs() < 1e-7);
+    }
+    assert!(lights.sample(Vec3::new(0.0, 3.0, 0.0), 0, [0.5, 0.5]).is_none());
+    assert_eq!(lights.choose(u32::MAX), Some(2));
+    assert_eq!(lights.pdf(11, Vec3::ZERO, 1.0, 1.0), 0.0);
+}
+
+/// Worlds without light, with dark, empty or broken sources.
+#[test]
+fn odd_worlds() {
+    assert!(Lights::new(&world(&[], &[], None)).is_empty());
+    assert!(Lights::new(&world(&[], &[], None)).sample(Vec3::ZERO, 7, [0.5; 2]).is_none());
+    let sky = Lights::new(&world(&[], &[], Some([1.0; 3])));
+    assert!((sky.sky_pdf() - 1.0 / (4.0 * std::f32::consts::PI)).abs() < 1e-7);
+    let flat = Primitive::Triangle([[0.0; 3]; 3]);
+    assert!(Lights::new(&world(&[(flat, 0)], &[1.0], None)).is_empty());
+    assert!(Lights::new(&world(&mixed(), &[0.0; 4], None)).is_empty());
+}
+
+/// The sum of many equal sources is one source: means of estimates of the same integral agree (10,000 triangles against one).
+#[test]
+fn many_sources() {
+    let n = 100;
+    let mut primitives = Vec::new();
+    for i in 0..n {
+        for j in 0..n {
+            let (x, z) = (i as f32 / n as f32, j as f32 / n as f32);
+            let s = 1.0 / n as f32;
+            primitives.push((Primitive::Triangle([[x, 1.0, z], [x + s, 1.0, z], [x, 1.0, z + s]]), 0));
+        }
+    }
+    let lights = Lights::new(&world(&primitives, &[1.0], None));
+    let mut sum = 0.0;
+    let samples = 1 << 14;
+    for i in 0..samples {
+        let v = Stream::new(1, 2, 2 * i).vertex(1, 1, 0);
+        let s = lights.sample(Vec3::ZERO, v[6], [unit(v[4]), unit(v[5])]).unwrap();
+        sum += f64::from(s.d.y / s.pdf);
+    }
+    // half of the square's irradiance: the triangles fill half of it, evenly. The square [0, 1]^2 at height 1 (Siegel and Howell, corner factor):
+    let h = 1.0 / 2.0f64.sqrt();
+    let square = std::f64::consts::PI * (h * libm::atan(h) * 2.0 / (2.0 * std::f64::consts::PI));
+    let found = sum / f64::from(samples);
+    assert!((found / (0.5 * square) - 1.0).abs() < 0.01, "{found} {}", 0.5 * square);
+}
+
+#[test]
+fn uniform_sphere_is_uniform() {
+    let mut rng = Rng(6);
+    let bins = 8;
+    let mut counts = vec![0.0; 2 * bins * bins];
+    let n = 200_000;
+    for _ in 0..n {
+        counts[sphere_bin(sphere::uniform([rng.f32(), rng.f32()]), bins)] += 1.0;
+    }
+    chi_square(&counts, &vec![f64::from(n) / counts.len() as f64; counts.len()]);
+}

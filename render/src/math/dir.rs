@@ -14,7 +14,7 @@ use bytemuck::{Pod, Zeroable};
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash, Pod, Zeroable)]
 pub struct UnitDir([u32; 2]);
 
-const STEPS: f32 = 536_870_912.0; // 2^29
+const STEPS: f64 = 536_870_912.0; // 2^29
 const FIELD: u32 = (1 << 30) - 1;
 
 impl UnitDir {
@@ -25,26 +25,32 @@ impl UnitDir {
         let w = v.map(f64::from);
         let scale = 1.5 - 0.5 * (w[0] * w[0] + w[1] * w[1] + w[2] * w[2]);
         let m = v.map(f32::abs);
-        let axis = if m[0] >= m[1] && m[0] >= m[2] {
-            0
-        } else if m[1] >= m[2] {
-            1
-        } else {
-            2
-        };
-        let (a, b) = OTHERS[axis];
-        // a product of 2^29 is exact; from 2^-5 on every float is a multiple of the step
-        let fixed = |x: f64| round_to_i32((x * scale) as f32 * STEPS) as u32;
-        let sign = v[axis].to_bits() >> 31;
-        UnitDir([(fixed(w[a]) & FIELD) | (axis as u32) << 30, (fixed(w[b]) & FIELD) | sign << 30])
+        let first = m[0] >= m[1] && m[0] >= m[2];
+        let second = !first && m[1] >= m[2];
+        let (a, b, c) = (
+            if first { w[1] } else { w[0] },
+            if first || second { w[2] } else { w[1] },
+            if first {
+                v[0]
+            } else if second {
+                v[1]
+            } else {
+                v[2]
+            },
+        );
+        let axis = if first { 0 } else { 2 - u32::from(second) };
+        UnitDir([
+            (fixed((a * scale) as f32) & FIELD) | axis << 30,
+            (fixed((b * scale) as f32) & FIELD) | c.to_bits() >> 31 << 30,
+        ])
     }
 
     /// The direction, of unit length to within a rounding of its largest component.
     #[inline]
     pub fn decode(self) -> [f32; 3] {
         let [x, y] = self.0;
-        let a = ((x << 2) as i32 >> 2) as f32 * (1.0 / STEPS);
-        let b = ((y << 2) as i32 >> 2) as f32 * (1.0 / STEPS);
+        let a = ((x << 2) as i32 >> 2) as f32 * (1.0 / STEPS as f32);
+        let b = ((y << 2) as i32 >> 2) as f32 * (1.0 / STEPS as f32);
         let (da, db) = (f64::from(a), f64::from(b));
         let c = (1.0 - da * da - db * db).max(0.0).sqrt() as f32;
         let c = f32::from_bits(c.to_bits() | (y << 1 & 0x8000_0000));
@@ -78,9 +84,9 @@ impl UnitDir {
 
 const OTHERS: [(usize, usize); 3] = [(1, 2), (0, 2), (0, 1)];
 
-/// To the nearest integer, of ties the one farther from 0 (`|x| < 2^31`).
+/// To steps of 2^-29, the nearest, of ties the even one; from 2^-5 on every float is a multiple of the step.
 #[inline(always)]
-fn round_to_i32(x: f32) -> i32 {
-    // from 2^23 on floats are integers, and adding a half would round
-    if x.abs() < 8_388_608.0 { (x + f32::copysign(0.5, x)) as i32 } else { x as i32 }
+fn fixed(x: f32) -> u32 {
+    // 1.5 x 2^52: its last place is 1, so the sum's low bits are the rounded integer
+    (f64::from(x) * STEPS + 6_755_399_441_055_744.0).to_bits() as u32
 }

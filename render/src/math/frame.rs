@@ -29,13 +29,16 @@ impl Basis {
 
     /// The frame whose local x is the part of `tangent` at right angles to `n`; that of [`Basis::new`] when there is none.
     pub fn with_tangent(n: Vec3, tangent: Vec3) -> Basis {
-        let s = tangent - n * n.dot(tangent);
+        let across = |v: Vec3| v - n * n.dot(v);
+        let s = across(tangent);
         let length2 = s.length_squared();
-        // what is left must be more than the rounding of the subtraction
-        if !(length2 > 1e-12 * tangent.length_squared()) || !length2.is_finite() {
+        // less than 1e-4 of the tangent is mostly rounding
+        if !(length2 > 1e-8 * tangent.length_squared()) || !length2.is_finite() {
             return Basis::new(n);
         }
-        let s = s / length2.sqrt();
+        // once more: of the first difference only some digits may be left
+        let s = across(s / length2.sqrt());
+        let s = s / s.length();
         Basis { s, t: n.cross(s), n }
     }
 

@@ -4,6 +4,8 @@ mod dir;
 mod frame;
 pub mod hash;
 mod offset;
+#[cfg(test)]
+mod tests;
 mod trig;
 
 pub use dir::UnitDir;

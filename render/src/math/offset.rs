@@ -66,13 +66,12 @@ pub fn offset_origin(at: &Position, n: Vec3) -> Vec3 {
     let distance = n.abs().dot(at.error) + at.test;
     let away = |p: f32, n: f32| {
         let o = p + n * distance;
-        if n > 0.0 {
-            o.next_up()
-        } else if n < 0.0 {
-            o.next_down()
-        } else {
-            o
-        }
+        // one ulp up for a positive n, down for a negative one: by the bits, in the direction of o's own sign or against it. At 0 the
+        // step would be to the other sign's NaNs: a component of exactly 0 stays.
+        let bits = o.to_bits();
+        let step = 1 - ((n.to_bits() ^ bits) >> 31 << 1) as i32;
+        let moved = f32::from_bits(bits.wrapping_add_signed(step));
+        if o == 0.0 || n == 0.0 { o } else { moved }
     };
     Vec3::new(away(at.p.x, n.x), away(at.p.y, n.y), away(at.p.z, n.z))
 }

@@ -31,9 +31,8 @@ pub fn concentric_disk(u: [f32; 2]) -> [f32; 2] {
     let (x, y) = (2.0 * u[0] - 1.0, 2.0 * u[1] - 1.0);
     let wide = x.abs() > y.abs();
     let (r, q) = if wide { (x, y) } else { (y, x) };
-    if r == 0.0 {
-        return [0.0, 0.0];
-    }
-    let (s, c) = sincos_small(FRAC_PI_4 * (q / r));
-    if wide { [r * c, r * s] } else { [r * s, r * c] }
+    // the centre: 0 / 1 for 0 / 0
+    let (s, c) = sincos_small(FRAC_PI_4 * (q / if r == 0.0 { 1.0 } else { r }));
+    let (along, across) = (r * c, r * s);
+    if wide { [along, across] } else { [across, along] }
 }

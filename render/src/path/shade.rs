@@ -1,11 +1,13 @@
 //! Shading of a batch.
 
+use std::f32::consts::FRAC_1_PI;
+
 use glam::Vec3;
 
 use super::interaction::Interaction;
 use super::{Context, Contribution, Outcome, PathRay, ShadowRay, Surface, Surfaces};
-use crate::material::Material;
-use crate::math::{UnitDir, unit};
+use crate::material::{Bsdf, Scatter};
+use crate::math::{Basis, UnitDir, concentric_disk, unit};
 use crate::ray::{Hit, PathKey};
 use crate::sampler::{BSDF, LIGHT, LIGHT_CHOICE, ROULETTE, Stream};
 
@@ -86,42 +88,114 @@ fn shade_hit(context: &Context, ray: &PathRay, hit: &Hit, surface: &Surface, out
         for child in 0..frame.split {
             let key = PathKey { branch: child as u16, ..ray.key };
             let sibling = PathRay { key, throughput: share, ..*ray };
-            scatter(context, &sibling, d, surface, material, &at, &stream, out);
+            scatter(context, &sibling, d, surface, &material.bsdf, &at, &stream, out);
         }
     } else {
-        scatter(context, ray, d, surface, material, &at, &stream, out);
+        scatter(context, ray, d, surface, &material.bsdf, &at, &stream, out);
     }
 }
 
-/// A shadow ray and a next ray from a point.
+/// A surface point's scattering, in world directions.
+trait Scattering {
+    /// As [`Bsdf::eval`].
+    fn eval(&self, wi: Vec3) -> Scatter;
+    /// As [`Bsdf::sample`].
+    fn sample(&self, u: [f32; 2]) -> Option<Vec3>;
+    /// The weight of the only direction there is, for a mirror.
+    fn delta_weight(&self) -> Option<Vec3>;
+}
+
+/// Any BSDF.
+struct General<'a> {
+    bsdf: &'a Bsdf,
+    basis: Basis,
+    wo: Vec3,
+}
+
+impl Scattering for General<'_> {
+    fn eval(&self, wi: Vec3) -> Scatter {
+        self.bsdf.eval(self.wo, self.basis.to_local(wi))
+    }
+    fn sample(&self, u: [f32; 2]) -> Option<Vec3> {
+        self.bsdf.sample(self.wo, u).map(|wi| self.basis.to_world(wi))
+    }
+    fn delta_weight(&self) -> Option<Vec3> {
+        self.bsdf.is_delta().then(|| self.bsdf.delta_weight(self.wo))
+    }
+}
+
+/// Diffuse: the same as [`General`], without a frame for what needs none.
+struct Diffuse {
+    reflectance: Vec3,
+    n: Vec3,
+}
+
+impl Scattering for Diffuse {
+    #[inline(always)]
+    fn eval(&self, wi: Vec3) -> Scatter {
+        let pdf = (self.n.dot(wi) * FRAC_1_PI).max(0.0);
+        Scatter { value: self.reflectance * pdf, pdf }
+    }
+    #[inline(always)]
+    fn sample(&self, u: [f32; 2]) -> Option<Vec3> {
+        let [x, y] = concentric_disk(u);
+        let z2 = 1.0 - x * x - y * y;
+        (z2 > 0.0).then(|| Basis::new(self.n).to_world(Vec3::new(x, y, z2.sqrt())))
+    }
+    #[inline(always)]
+    fn delta_weight(&self) -> Option<Vec3> {
+        None
+    }
+}
+
 #[inline(always)]
 fn scatter(
     context: &Context,
     ray: &PathRay,
     d: Vec3,
     surface: &Surface,
-    material: &Material,
+    bsdf: &Bsdf,
+    at: &Interaction,
+    stream: &Stream,
+    out: &mut Outcome,
+) {
+    if let Bsdf::Diffuse { reflectance } = bsdf {
+        let diffuse = Diffuse { reflectance: Vec3::from(*reflectance), n: at.shading };
+        scatter_by(context, ray, &diffuse, at, stream, out);
+    } else {
+        let basis = at.basis(surface, bsdf.is_anisotropic());
+        let general = General { bsdf, basis, wo: basis.to_local(-d) };
+        scatter_by(context, ray, &general, at, stream, out);
+    }
+}
+
+/// A shadow ray and a next ray from a point.
+#[inline(always)]
+fn scatter_by<B: Scattering>(
+    context: &Context,
+    ray: &PathRay,
+    bsdf: &B,
     at: &Interaction,
     stream: &Stream,
     out: &mut Outcome,
 ) {
     let frame = context.frame;
-    let bsdf = &material.bsdf;
     let key = PathKey { vertex: ray.key.vertex + 1, ..ray.key };
     let numbers = stream.vertex(u32::from(key.vertex), frame.split, u32::from(key.branch));
     let origin = at.origin();
-    let basis = at.basis(surface, bsdf.is_anisotropic());
-    let wo = basis.to_local(-d);
     let throughput = Vec3::from(ray.throughput);
+    let delta = bsdf.delta_weight();
 
-    if !bsdf.is_delta() {
+    if delta.is_none() {
         let place = [unit(numbers[LIGHT]), unit(numbers[LIGHT + 1])];
-        if let Some(light) = context.lights.sample(origin, numbers[LIGHT_CHOICE], place) {
+        // by the geometric normal too, or light would leak through the surface; before and after snapping
+        if let Some(light) = context.lights.sample(origin, numbers[LIGHT_CHOICE], place)
+            && light.d.dot(at.normal) > 0.0
+        {
             let dir = UnitDir::encode(light.d.to_array());
             let wi = Vec3::from(dir.decode());
-            // by the geometric normal too, or light would leak through the surface
             if wi.dot(at.normal) > 0.0 {
-                let scattered = bsdf.eval(wo, basis.to_local(wi));
+                let scattered = bsdf.eval(wi);
                 let weight = power_heuristic(light.pdf, scattered.pdf) / light.pdf;
                 let contribution = throughput * scattered.value * light.radiance * weight;
                 if contribution != Vec3::ZERO {
@@ -137,21 +211,23 @@ fn scatter(
         }
     }
 
-    let Some(wi) = bsdf.sample(wo, [unit(numbers[BSDF]), unit(numbers[BSDF + 1])]) else {
+    let Some(wi) = bsdf.sample([unit(numbers[BSDF]), unit(numbers[BSDF + 1])]) else {
         out.counters.absorbed += 1;
         return;
     };
-    let dir = UnitDir::encode(basis.to_world(wi).to_array());
+    let dir = UnitDir::encode(wi.to_array());
     let wi = Vec3::from(dir.decode());
     // of the direction as it travels
-    let (weight, pdf) = if bsdf.is_delta() {
-        (bsdf.delta_weight(wo), 0.0)
-    } else {
-        let scattered = bsdf.eval(wo, basis.to_local(wi));
-        (scattered.value / scattered.pdf, scattered.pdf)
+    let (weight, pdf) = match delta {
+        Some(weight) => (weight, 0.0),
+        None => {
+            let scattered = bsdf.eval(wi);
+            (scattered.value / scattered.pdf, scattered.pdf)
+        }
     };
     let mut throughput = throughput * weight;
     let largest = throughput.max_element();
+    // false for NaN: 0 / 0 of a direction that snapping took below the horizon
     if !(wi.dot(at.normal) > 0.0 && largest > 0.0) {
         out.counters.absorbed += 1;
         return;

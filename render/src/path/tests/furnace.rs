@@ -1,20 +1,7 @@
 //! Closed forms: enclosures whose radiance is a geometric series.
 
 use super::brute::{Scene, frame};
-use crate::film::FilmPart;
-use crate::light::Lights;
-use crate::path::{Context, reference};
-
-fn mean(scene: &Scene, frame: &crate::frame::Frame, samples: u32) -> f64 {
-    let world = scene.world();
-    let lights = Lights::new(&world);
-    let context = Context { world: &world, lights: &lights, frame };
-    let mut film = FilmPart::new(frame.size);
-    reference::render(&context, scene, 0..samples, &mut film);
-    assert_eq!(film.rejected().count, 0);
-    let picture = film.resolve(samples);
-    picture.iter().map(|p| f64::from(p[0])).sum::<f64>() / picture.len() as f64
-}
+use super::mean_of;
 
 /// Inside a sphere that emits 1 and reflects a, paths of n rays see 1 + a + .. + a^(n-1), whatever is sampled.
 #[test]
@@ -25,7 +12,7 @@ fn sphere_from_inside() {
         let shape = scene.shape(material, Some([1.0; 3]));
         scene.sphere(shape, [0.1, -0.2, 0.3], 2.0, true);
         let expected: f64 = (0..depth).map(|k| 0.7f64.powi(k as i32)).sum();
-        let found = mean(&scene, &frame([0.5, 0.25, -0.3], 70.0, [8, 8], depth), 256);
+        let found = mean_of(&scene, &frame([0.5, 0.25, -0.3], 70.0, [8, 8], depth), 256);
         println!("depth {depth}: {found} {expected}");
         assert!((found / expected - 1.0).abs() < 0.01, "depth {depth}: {found} instead of {expected}");
     }
@@ -52,7 +39,7 @@ fn box_from_inside() {
         let shape = scene.shape(material, Some([1.0; 3]));
         box_inside(&mut scene, shape);
         let expected: f64 = (0..depth).map(|k| 0.6f64.powi(k as i32)).sum();
-        let found = mean(&scene, &frame([0.3, 0.25, -0.3], 70.0, [8, 8], depth), 256);
+        let found = mean_of(&scene, &frame([0.3, 0.25, -0.3], 70.0, [8, 8], depth), 256);
         println!("depth {depth}: {found} {expected}");
         assert!((found / expected - 1.0).abs() < 0.01, "depth {depth}: {found} instead of {expected}");
     }

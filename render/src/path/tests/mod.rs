@@ -1,4 +1,26 @@
 //! Tests of light transport: closed forms, and a plain intersector to trace with.
 
 mod brute;
+mod cornell;
+mod direct;
 mod furnace;
+mod step;
+
+use brute::Scene;
+
+use super::{Context, reference};
+use crate::film::FilmPart;
+use crate::frame::Frame;
+use crate::light::Lights;
+
+/// Mean of the picture's red; nothing may be rejected.
+fn mean_of(scene: &Scene, frame: &Frame, samples: u32) -> f64 {
+    let world = scene.world();
+    let lights = Lights::new(&world);
+    let context = Context { world: &world, lights: &lights, frame };
+    let mut film = FilmPart::new(frame.size);
+    reference::render(&context, scene, 0..samples, &mut film);
+    assert_eq!(film.rejected().count, 0);
+    let picture = film.resolve(samples);
+    picture.iter().map(|p| f64::from(p[0])).sum::<f64>() / picture.len() as f64
+}

@@ -1,0 +1,106 @@
+//! Direct light in closed form, seen from a point through a narrow camera.
+
+use glam::DVec3;
+
+use super::brute::{Scene, frame};
+use super::mean_of;
+use crate::material::{Bsdf, Distribution};
+
+const PI: f64 = std::f64::consts::PI;
+
+/// A floor at y = 0 (front up) of albedo 0.5, and a frame of 4 x 4 pixels that sees the point (0, 0, 3) under 45 degrees, 0.001 wide.
+fn floor() -> (Scene, crate::frame::Frame) {
+    let mut scene = Scene::default();
+    let material = scene.diffuse(0.5);
+    let shape = scene.shape(material, None);
+    scene.quad(shape, [-50.0, 0.0, -50.0], [0.0, 0.0, 100.0], [100.0, 0.0, 0.0]);
+    let s = 0.5f64.sqrt();
+    let mut frame = frame([0.0; 3], 0.02, [4, 4], 2);
+    // z of the camera: (0, -s, s); y: (0, s, s); x: to the left
+    let rows = [[1.0, 0.0, 0.0, 0.0], [0.0, s, -s, 3.0], [0.0, s, s, 0.0]];
+    frame.camera = crate::camera::Camera::new(&rows, 0.02, [4, 4], [0.0; 3]).unwrap();
+    (scene, frame)
+}
+
+/// Irradiance at `p` of a polygon of radiance 1 that lies above the plane of normal `n` (Lambert 1760).
+fn polygon(p: DVec3, n: DVec3, vertices: &[DVec3]) -> f64 {
+    let sides = vertices.iter().zip(vertices.iter().cycle().skip(1));
+    0.5 * sides
+        .map(|(a, b)| {
+            let (a, b) = ((*a - p).normalize(), (*b - p).normalize());
+            a.cross(b).normalize().dot(n) * a.dot(b).acos()
+        })
+        .sum::<f64>()
+        .abs()
+}
+
+#[test]
+fn rectangle_over_a_plane() {
+    let (mut scene, frame) = floor();
+    let black = scene.diffuse(0.0);
+    let light = scene.shape(black, Some([2.0; 3]));
+    scene.quad(light, [0.3, 1.0, 2.0], [1.5, 0.0, 0.0], [0.0, 0.3, 1.0]);
+    let corner = DVec3::new(0.3, 1.0, 2.0);
+    let (a, b) = (DVec3::new(1.5, 0.0, 0.0), DVec3::new(0.0, 0.3, 1.0));
+    let e = 2.0 * polygon(DVec3::new(0.0, 0.0, 3.0), DVec3::Y, &[corner, corner + a, corner + a + b, corner + b]);
+    let expected = 0.5 / PI * e;
+    let found = mean_of(&scene, &frame, 4096);
+    println!("{found} {expected}");
+    assert!((found / expected - 1.0).abs() < 0.002, "{found} {expected}");
+}
+
+/// E = pi L (r / d)^2 cos, for a sphere wholly above the horizon: near, small and far ones.
+#[test]
+fn sphere_over_a_plane() {
+    for (center, r) in [([0.0, 2.0, 3.0], 0.7), ([1.0, 1.5, 4.0], 1.0), ([3.0, 40.0, 10.0], 0.01)] {
+        let (mut scene, frame) = floor();
+        let black = scene.diffuse(0.0);
+        let light = scene.shape(black, Some([3.0; 3]));
+        scene.sphere(light, center, r, false);
+        let way = DVec3::from(center.map(f64::from)) - DVec3::new(0.0, 0.0, 3.0);
+        let d = way.length();
+        let expected = 0.5 * 3.0 * (f64::from(r) / d).powi(2) * way.y / d;
+        let found = mean_of(&scene, &frame, 2048);
+        println!("{found} {expected}");
+        assert!((found / expected - 1.0).abs() < 0.002, "{found} {expected}");
+    }
+}
+
+/// An open sky on a floor: albedo times radiance, also when another light makes the sky a choice among others.
+#[test]
+fn open_sky() {
+    for other in [false, true] {
+        let (mut scene, frame) = floor();
+        scene.environment = Some([4.0; 3]);
+        if other {
+            let black = scene.diffuse(0.0);
+            let light = scene.shape(black, Some([1.0; 3]));
+            // shines away from the floor's point and covers nothing of its sky: below the floor
+            scene.quad(light, [-1.0, -3.0, -1.0], [2.0, 0.0, 0.0], [0.0, 0.0, 2.0]);
+        }
+        let found = mean_of(&scene, &frame, 2048);
+        println!("{found}");
+        assert!((found / 2.0 - 1.0).abs() < 0.002, "{found}");
+    }
+}
+
+/// A convex metal body under an even sky: a mirror shows the sky times its reflectance, a rough one less by its microfacets' shadows.
+#[test]
+fn metal_under_the_sky() {
+    for distribution in [None, Some(Distribution::Beckmann), Some(Distribution::Ggx)] {
+        let mut scene = Scene { environment: Some([1.0; 3]), ..Scene::default() };
+        let (eta, k, specular) = ([0.0; 3], [1.0; 3], [0.8; 3]);
+        let bsdf = match distribution {
+            None => Bsdf::Conductor { eta, k, specular },
+            Some(distribution) => Bsdf::RoughConductor { distribution, alpha: [0.05, 0.1], eta, k, specular },
+        };
+        let material = scene.material(bsdf, false);
+        let shape = scene.shape(material, None);
+        scene.sphere(shape, [0.0, 0.0, 5.0], 1.0, false);
+        let found = mean_of(&scene, &frame([0.0; 3], 5.0, [4, 4], 3), 256);
+        println!("{distribution:?}: {found}");
+        // GGX keeps 0.99275 of perpendicular light at this roughness (4 million normals, a separate program); Beckmann all but 1e-4
+        let expected = if distribution == Some(Distribution::Ggx) { 0.8 * 0.99275 } else { 0.8 };
+        assert!((found / expected - 1.0).abs() < 0.002, "{distribution:?}: {found} {expected}");
+    }
+}

@@ -1,0 +1,298 @@
+//! Properties of the step itself.
+
+use glam::Vec3;
+
+use super::brute::{Scene, frame};
+use super::furnace::box_inside;
+use super::{cornell, mean_of};
+use crate::film::FilmPart;
+use crate::frame::Frame;
+use crate::light::Lights;
+use crate::material::{Bsdf, Distribution};
+use crate::math::UnitDir;
+use crate::path::reference::{self, Tracer};
+use crate::path::{Context, Outcome, PathRay, camera_ray, shade};
+use crate::ray::{Hit, PathKey};
+use crate::testing::Rng;
+
+fn channel_means(scene: &Scene, lights: Option<&Lights>, frame: &Frame, samples: u32) -> ([f64; 3], f64) {
+    let world = scene.world();
+    let own = Lights::new(&world);
+    let context = Context { world: &world, lights: lights.unwrap_or(&own), frame };
+    let mut film = FilmPart::new(frame.size);
+    reference::render(&context, scene, 0..samples, &mut film);
+    let picture = film.resolve(samples);
+    let mean = std::array::from_fn(|c| picture.iter().map(|p| f64::from(p[c])).sum::<f64>() / picture.len() as f64);
+    (mean, film.rel_mse(samples).unwrap())
+}
+
+#[track_caller]
+fn close(a: [f64; 3], b: [f64; 3], tolerance: f64) {
+    for c in 0..3 {
+        assert!((a[c] / b[c] - 1.0).abs() < tolerance, "{a:?} {b:?}");
+    }
+}
+
+/// The same mean and less variance, at equal camera rays (whose own noise both share).
+#[test]
+fn splitting_keeps_the_mean_and_lowers_variance() {
+    let scene = cornell::scene();
+    let frame = cornell::frame(16);
+    let (one, error_one) = channel_means(&scene, None, &frame, 64);
+    let (many, error_many) = channel_means(&scene, None, &Frame { split: 16, ..frame }, 64);
+    println!("{one:?} {error_one}; {many:?} {error_many}");
+    close(one, many, 0.006);
+    assert!(error_many < 0.7 * error_one, "{error_many} {error_one}");
+}
+
+/// Without light sampling (no table: density 0, BSDF rays weigh all), with roulette from the start, and without: one mean.
+#[test]
+fn estimators_agree() {
+    let mut scene = cornell::scene();
+    let (shape, k) = (scene.primitives.last().unwrap().1, [3.0, 2.4, 1.6]);
+    let gold = Bsdf::RoughConductor {
+        distribution: Distribution::Ggx,
+        alpha: [0.3, 0.3],
+        eta: [0.2, 0.4, 1.4],
+        k,
+        specular: [1.0; 3],
+    };
+    // one face of the large box of metal
+    scene.shapes[shape as usize].material = scene.material(gold, true);
+    // and a large light, which BSDF sampling finds
+    for shape in &mut scene.shapes {
+        if shape.emission.is_some() {
+            shape.emission = Some([1.0, 0.8, 0.5]);
+        }
+    }
+    scene.quad(0, [-0.9, 0.97, -0.9], [1.8, 0.0, 0.0], [0.0, 0.0, 1.8]);
+    let frame = Frame { max_depth: 5, ..cornell::frame(16) };
+    let (mean, _) = channel_means(&scene, None, &frame, 512);
+    let none = Lights::new(&Scene { shapes: scene.shapes.clone(), ..Scene::default() }.world());
+    let (bsdf_only, _) = channel_means(&scene, Some(&none), &frame, 512);
+    let (roulette, _) = channel_means(&scene, None, &Frame { rr_depth: 1, ..frame.clone() }, 512);
+    println!("{mean:?} {bsdf_only:?} {roulette:?}");
+    close(mean, bsdf_only, 0.006);
+    close(mean, roulette, 0.006);
+}
+
+/// Every ray alone gives what the batch gives, in any order.
+#[test]
+fn batches_do_not_matter() {
+    let scene = cornell::scene();
+    let frame = Frame { split: 3, ..cornell::frame(16) };
+    let world = scene.world();
+    let lights = Lights::new(&world);
+    let context = Context { world: &world, lights: &lights, frame: &frame };
+    let mut rays: Vec<PathRay> = (0..256).map(|p| camera_ray(&frame, p, 3)).collect();
+    for _ in 0..4 {
+        let hits: Vec<Hit> = rays.iter().map(|r| scene.closest(&r.ray())).collect();
+        let mut whole = Outcome::default();
+        shade(&context, &scene, &rays, &hits, &mut whole);
+        let mut parts = Outcome::default();
+        for size in [1, 2, 3, 7, 16, 100] {
+            parts.clear();
+            for (r, h) in rays.chunks(size).zip(hits.chunks(size)) {
+                shade(&context, &scene, r, h, &mut parts);
+            }
+            assert_eq!((&parts.light, &parts.shadow, &parts.next), (&whole.light, &whole.shadow, &whole.next));
+        }
+        let (mut r, mut h) = (rays.clone(), hits.clone());
+        r.reverse();
+        h.reverse();
+        parts.clear();
+        shade(&context, &scene, &r, &h, &mut parts);
+        let sorted = |o: &Outcome| {
+            let mut bytes: Vec<Vec<u8>> = o.next.iter().map(|x| bytemuck::bytes_of(x).to_vec()).collect();
+            bytes.extend(o.shadow.iter().map(|x| bytemuck::bytes_of(x).to_vec()));
+            bytes.extend(o.light.iter().map(|x| bytemuck::bytes_of(x).to_vec()));
+            bytes.sort();
+            bytes
+        };
+        assert_eq!(sorted(&parts), sorted(&whole));
+        rays = whole.next;
+    }
+}
+
+/// Depth counts as Mitsuba's: 1 sees emitters only, 2 direct light.
+#[test]
+fn depth_is_the_number_of_rays() {
+    let scene = cornell::scene();
+    let world = scene.world();
+    let lights = Lights::new(&world);
+    for max_depth in 1..5 {
+        let frame = Frame { max_depth, ..cornell::frame(16) };
+        let context = Context { world: &world, lights: &lights, frame: &frame };
+        let mut rays: Vec<PathRay> = (0..256).map(|p| camera_ray(&frame, p, 0)).collect();
+        for depth in 1..=max_depth {
+            let hits: Vec<Hit> = rays.iter().map(|r| scene.closest(&r.ray())).collect();
+            let mut out = Outcome::default();
+            shade(&context, &scene, &rays, &hits, &mut out);
+            assert_eq!(out.next.is_empty(), depth == max_depth, "{depth} of {max_depth}");
+            assert_eq!(out.shadow.is_empty(), depth == max_depth);
+            assert!(out.next.iter().all(|r| u32::from(r.key.vertex) == depth));
+            rays = out.next;
+        }
+    }
+}
+
+/// A closed box with wild shading normals, lit from outside only: no light comes in, though the normals would let it.
+#[test]
+fn shading_normals_leak_nothing() {
+    let mut scene = Scene { environment: Some([1.0; 3]), ..Scene::default() };
+    let material = scene.diffuse(0.9);
+    let shape = scene.shape(material, None);
+    box_inside(&mut scene, shape);
+    let mut rng = Rng(1);
+    for normals in &mut scene.normals {
+        *normals = Some(std::array::from_fn(|_| rng.direction().to_array()));
+    }
+    let light = scene.shape(material, Some([10.0; 3]));
+    scene.sphere(light, [0.0, 5.0, 0.0], 2.0, false);
+    assert_eq!(mean_of(&scene, &frame([0.1, 0.2, -0.3], 80.0, [16, 16], 6), 64), 0.0);
+}
+
+/// No ray that leaves a surface meets it again: one large triangle or sphere under the sky, near and far from the origin, grazing
+/// views included.
+#[test]
+fn surfaces_do_not_shade_themselves() {
+    let mut rng = Rng(2);
+    let mut left = 0;
+    for i in 0..40_000 {
+        let mut scene = Scene { environment: Some([1.0; 3]), ..Scene::default() };
+        let material = scene.diffuse(0.9);
+        let shape = scene.shape(material, None);
+        let at = rng.vec3([0.0, 1.0, 1000.0][i % 3]);
+        let size = [0.01, 1.0, 30.0][i / 3 % 3];
+        let target = if i % 2 == 0 {
+            scene.sphere(shape, at.to_array(), size, false);
+            at + rng.direction() * size * 0.99
+        } else {
+            let (a, b) = (rng.vec3(size), rng.vec3(size));
+            scene.quad(shape, at.to_array(), a.to_array(), b.to_array());
+            at + a * rng.f32() + b * rng.f32()
+        };
+        let world = scene.world();
+        let lights = Lights::new(&world);
+        let frame = frame([0.0; 3], 45.0, [1, 1], 3);
+        let context = Context { world: &world, lights: &lights, frame: &frame };
+        let mut ray = camera_ray(&frame, 0, i as u32);
+        let mut o = target + rng.direction() * size * [0.1, 3.0, 50.0][i / 9 % 3];
+        if i % 2 == 0 {
+            o = at + (o - at).normalize() * (o - at).length().max(1.01 * size);
+        }
+        ray.o = o.to_array();
+        ray.dir = UnitDir::encode((target - o).normalize().to_array());
+        let hit = scene.closest(&ray.ray());
+        if !hit.is_hit() {
+            continue;
+        }
+        let mut out = Outcome::default();
+        shade(&context, &scene, &[ray], &[hit], &mut out);
+        for r in out.next.iter().map(|r| r.ray()).chain(out.shadow.iter().map(|s| s.ray())) {
+            left += 1;
+            assert!(!scene.occluded(&r), "case {i}: {r:?} {:?}", scene.closest(&r));
+        }
+    }
+    assert!(left > 30_000, "{left}");
+}
+
+/// A shadow ray ends before its light: with nothing else there, each of them arrives, also at grazing angles.
+#[test]
+fn lights_do_not_shadow_themselves() {
+    let mut rng = Rng(3);
+    let mut rays = 0;
+    for i in 0..20_000 {
+        let mut scene = Scene::default();
+        let material = scene.diffuse(0.9);
+        let light = scene.shape(material, Some([1.0; 3]));
+        let far = [1.0, 100.0][i % 2];
+        let at = rng.vec3(far);
+        if i / 2 % 2 == 0 {
+            scene.sphere(light, at.to_array(), [0.001, 0.1, 1.0][i % 3], i % 5 == 0);
+        } else {
+            scene.quad(light, at.to_array(), rng.vec3(1.0).to_array(), rng.vec3(1.0).to_array());
+        }
+        let lights = Lights::new(&scene.world());
+        let o = at + rng.vec3([0.02, 2.0, 50.0][i % 3]);
+        let Some(s) = lights.sample(o, rng.u32(), [rng.f32(), rng.f32()]) else { continue };
+        let d = UnitDir::encode(s.d.to_array()).decode();
+        let ray = crate::ray::Ray { o: o.to_array(), tmin: 0.0, d, tmax: s.tmax };
+        rays += 1;
+        assert!(!scene.occluded(&ray), "case {i}: {ray:?} {:?}", scene.closest(&ray));
+    }
+    assert!(rays > 5000, "{rays}");
+}
+
+/// 100,000 random surfaces, rays and hits, degenerate ones among them: whatever comes out is finite and not negative.
+#[test]
+fn nothing_is_nan() {
+    let mut rng = Rng(4);
+    let sizes = [0.0, 1e-30, 1e-6, 1.0, 1e6];
+    for i in 0..5_000 {
+        let mut scene = Scene { environment: (i % 3 == 0).then_some([1.0; 3]), ..Scene::default() };
+        let bsdf = match i % 4 {
+            0 => Bsdf::Diffuse { reflectance: [rng.f32(), 0.0, 1.0] },
+            1 => Bsdf::Conductor { eta: [0.2; 3], k: [3.0; 3], specular: [1.0; 3] },
+            j => Bsdf::RoughConductor {
+                distribution: if j == 2 { Distribution::Beckmann } else { Distribution::Ggx },
+                alpha: [[1e-4, 0.1, 1.0][i % 3], [1e-4, 0.1, 1.0][i / 3 % 3]],
+                eta: [0.2; 3],
+                k: [3.0; 3],
+                specular: [1.0; 3],
+            },
+        };
+        let material = scene.material(bsdf, rng.u32() & 1 == 0);
+        let shapes = [scene.shape(material, None), scene.shape(material, Some([rng.f32(), 1.0, 1e6]))];
+        for _ in 0..4 {
+            let size = sizes[(rng.u32() % 5) as usize];
+            let place = sizes[(rng.u32() % 5) as usize];
+            let corner = rng.vec3(place);
+            let shape = shapes[(rng.u32() % 2) as usize];
+            if rng.u32() % 3 == 0 {
+                scene.sphere(shape, corner.to_array(), size.max(1e-6), rng.u32() & 1 == 0);
+            } else {
+                scene.quad(shape, corner.to_array(), rng.vec3(size).to_array(), rng.vec3(size).to_array());
+                if rng.u32() & 1 == 0 {
+                    let n = scene.normals.len();
+                    scene.normals[n - 1] = Some([rng.vec3(1.0).to_array(), rng.vec3(1e-20).to_array(), [0.0; 3]]);
+                }
+            }
+        }
+        let world = scene.world();
+        let lights = Lights::new(&world);
+        let frame = Frame { rr_depth: 2, split: 1 + rng.u32() % 2, ..frame([0.0; 3], 45.0, [8, 8], 10) };
+        let context = Context { world: &world, lights: &lights, frame: &frame };
+        let mut out = Outcome::default();
+        for _ in 0..20 {
+            let (vertex, place) = ((rng.u32() % 9) as u16, sizes[(rng.u32() % 5) as usize]);
+            let ray = PathRay {
+                o: rng.vec3(place).to_array(),
+                dir: UnitDir::encode(rng.direction().to_array()),
+                key: PathKey { pixel: rng.u32() % 64, sample: rng.u32() % 100, branch: 0, vertex },
+                throughput: [rng.f32(), 1.0, 1e-10],
+                pdf: [0.0, 1e-3, 1.0, 1e10][(rng.u32() % 4) as usize],
+            };
+            let prim = rng.u32() % scene.primitives.len() as u32;
+            let u = rng.f32();
+            let traced = scene.closest(&ray.ray());
+            let hit = if traced.is_hit() {
+                traced
+            } else {
+                Hit { t: rng.f32() * 10.0, u, v: (1.0 - u) * rng.f32(), prim, leaf: 0 }
+            };
+            shade(&context, &scene, &[ray], &[hit], &mut out);
+        }
+        let good = |v: &[f32]| v.iter().all(|&x| x >= 0.0 && x.is_finite());
+        for l in &out.light {
+            assert!(good(&l.value), "{l:?}");
+        }
+        for s in &out.shadow {
+            assert!(good(&s.contribution) && s.tmax >= 0.0 && Vec3::from(s.o).is_finite(), "{s:?}");
+        }
+        for r in &out.next {
+            assert!(good(&r.throughput) && good(&[r.pdf]) && Vec3::from(r.o).is_finite(), "{r:?}");
+            assert!((Vec3::from(r.dir.decode()).length() - 1.0).abs() < 1e-6);
+        }
+    }
+}
