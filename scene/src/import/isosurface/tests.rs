@@ -200,6 +200,111 @@ fn sphere() {
     assert!((volume_inside(&triangles) / ball - 1.0).abs() < 0.02);
 }
 
+/// Every configuration with random values, alone among outsides, and its inverse among insides.
+#[test]
+fn every_configuration_is_closed() {
+    let dims = [4; 3];
+    let mut random = Random(5);
+    for config in 0..256 {
+        for sign in [1.0, -1.0] {
+            for _ in 0..20 {
+                let samples = fill(dims, |[x, y, z]| {
+                    let inner = [x, y, z].iter().all(|&v| v == 1.0 || v == 2.0);
+                    let corner = (x - 1.0) as u32 + 2 * (y - 1.0) as u32 + 4 * (z - 1.0) as u32;
+                    let inside = inner && config >> corner & 1 == 1;
+                    let v = 0.01 + random.signed().abs();
+                    if inside { sign * v } else { -sign * v }
+                });
+                let triangles = march(dims, &samples, 0.0, Affine::IDENTITY);
+                assert_eq!(triangles.is_empty(), config == 0);
+                // all edges are inner edges, as the border is of one side
+                check_closed(dims, &triangles);
+                if config != 0 {
+                    assert_eq!(volume_inside(&triangles) > 0.0, sign > 0.0);
+                }
+            }
+        }
+    }
+}
+
+#[test]
+fn gyroid() {
+    let dims = [30, 28, 26];
+    let samples = fill(dims, |p| {
+        let [x, y, z] = p.map(|v| 0.45 * v + 0.1);
+        libm::sin(x) * libm::cos(y) + libm::sin(y) * libm::cos(z) + libm::sin(z) * libm::cos(x)
+    });
+    let triangles = march(dims, &samples, 0.1, Affine::IDENTITY);
+    assert!(triangles.len() > 10_000);
+    check_closed(dims, &triangles);
+}
+
+/// Whatever the placement does, the front is outside.
+#[test]
+fn mirrored_placements_keep_the_front() {
+    let dims = [9, 10, 11];
+    let samples = fill(dims, |p| 3.2 - p.iter().map(|v| (v - 4.4).powi(2)).sum::<f64>().sqrt());
+    let plain = volume_inside(&march(dims, &samples, 0.0, Affine::IDENTITY));
+    for map in [
+        [[-2.0, 0.0, 0.0, 7.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]],
+        [[0.0, 2.0, 0.0, 7.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]],
+        [[0.0, 2.0, 0.0, 7.0], [-1.0, 0.5, 0.0, 0.0], [0.0, 0.0, 1.0, -3.0]],
+    ] {
+        let volume = volume_inside(&march(dims, &samples, 0.0, Affine(map)));
+        assert!((volume - 2.0 * plain).abs() < 1e-9 * plain, "{volume} {plain}");
+    }
+}
+
+/// Samples that equal the value are outside; triangles that shrink to nothing there are in the stream.
+#[test]
+fn samples_on_the_surface() {
+    let dims = [5; 3];
+    let samples = fill(dims, |[x, y, z]| if x == 2.0 && y == 2.0 { z - 2.0 } else { -1.0 });
+    let triangles = march(dims, &samples, 0.0, Affine::IDENTITY);
+    let flat = |t: &Triangle| (0..3).any(|k| key(t[k]) == key(t[(k + 1) % 3]));
+    // the tip at (2, 2, 2) is a pyramid of four triangles without a degenerate one, with two insides above it
+    assert_eq!(triangles.iter().filter(|t| flat(t)).count(), 0);
+    assert_eq!(triangles.iter().filter(|t| t.contains(&[2.0; 3])).count(), 4);
+    // one outside that equals the value, among insides: eight triangles of no size
+    let samples = fill(dims, |p| if p == [2.0; 3] { 0.0 } else { 1.0 });
+    let triangles = march(dims, &samples, 0.0, Affine::IDENTITY);
+    assert_eq!(triangles, vec![[[2.0; 3]; 3]; 8]);
+}
+
+#[test]
+fn samples_that_are_not_finite() {
+    let dims = [4; 3];
+    for odd in [f64::NAN, f64::INFINITY, f64::NEG_INFINITY, f64::MAX, f64::MIN] {
+        let samples = fill(dims, |p| if p == [1.0; 3] { odd } else { p[0] - 1.5 });
+        let triangles = march(dims, &samples, 0.0, Affine::IDENTITY);
+        assert!(triangles.len() >= 18);
+        let sound = |t: &Triangle| t.as_flattened().iter().all(|v| (0.0..=3.0).contains(v) || v.is_nan());
+        assert!(triangles.iter().all(sound));
+    }
+}
+
+#[test]
+fn what_has_no_surface() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("a.nrrd");
+    let write = |sizes: &str, data: &[u8]| {
+        let text = format!("NRRD0004\ndimension: 3\nsizes: {sizes}\ntype: uchar\nencoding: raw\n\n");
+        std::fs::write(&path, [text.as_bytes(), data].concat()).unwrap();
+    };
+    write("2 4 1", &[0; 8]);
+    let message = IsoSurfaceSource::new(&path, 1.0).unwrap_err().to_string();
+    assert!(message.contains("2 x 4 x 1 samples hold no surface"), "{message}");
+    write("2 2 2", &[0, 0, 0, 0, 9, 9, 9, 9]);
+    for iso in [f64::NAN, f64::INFINITY] {
+        assert!(IsoSurfaceSource::new(&path, iso).unwrap_err().to_string().contains("is not a number"));
+    }
+    for (iso, count) in [(4.0, 2), (9.0, 0), (-1.0, 0)] {
+        let source = IsoSurfaceSource::new(&path, iso).unwrap();
+        let mut records = Vec::new();
+        assert_eq!(source.open().unwrap().next(&mut records, 100).unwrap(), count);
+    }
+}
+
 /// Whenever the inside of a cell joins what its surface leaves apart, it joins two regions, and there is one filling with a
 /// tube for them; and following planes along another axis finds the same.
 #[test]

@@ -8,6 +8,8 @@ mod layout;
 mod nifti;
 mod nrrd;
 mod slices;
+#[cfg(test)]
+mod tests;
 
 use std::fs::File;
 use std::io::Read;

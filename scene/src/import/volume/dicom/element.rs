@@ -97,11 +97,13 @@ pub fn read<R: Read + Seek>(file: R, wanted: &[Tag]) -> Result<Option<DataSet>, 
             set.pixels = Some((reader.at, length));
             break;
         }
-        if wanted.contains(&tag) && length != UNDEFINED && &vr != b"SQ" {
+        // each tag counts once, so that memory is bounded
+        let keep = wanted.contains(&tag) && set.values.iter().all(|v| v.0 != tag);
+        if keep && length != UNDEFINED && &vr != b"SQ" {
             let value = reader.value(tag, length)?;
             set.values.push((tag, value));
         } else {
-            if wanted.contains(&tag) {
+            if keep {
                 set.values.push((tag, Vec::new())); // a sequence: that it is there is all that can be known
             }
             reader.skip_element(syntax, vr, length, 0)?;

@@ -183,7 +183,8 @@ fn read(path: &Path, bytes: &Rc<Cell<u64>>) -> Result<Option<Found>, ImportError
         return Ok(None); // opening a pipe would wait for ever
     }
     let file = Counted { file: File::open(path).map_err(io)?, bytes: bytes.clone() };
-    match element::read(BufReader::new(file), WANTED) {
+    // headers of a slice have some 2 KB, and what is read beyond them is read again in each pass
+    match element::read(BufReader::with_capacity(2048, file), WANTED) {
         Ok(Some(set)) if set.pixels.is_some() => {
             Ok(Some(Found { path: path.to_owned(), series: string(&set, SERIES).unwrap_or_default(), set }))
         }
