@@ -115,7 +115,7 @@ pub(super) fn check_dims(path: &Path, line: u32, dims: [u64; 3]) -> Result<[usiz
         _ => Err(ImportError::Limit {
             path: path.to_owned(),
             message: format!(
-                "the header says {} x {} x {} samples; a slice may have {MAX_SLICE_SAMPLES}: make the volume smaller",
+                "the header says {} x {} x {} samples; a slice may have {MAX_SLICE_SAMPLES}: crop or resample it first",
                 dims[0], dims[1], dims[2]
             ),
         }),

@@ -21,8 +21,8 @@ use layout::Layout;
 pub use layout::SampleType;
 pub use slices::Slices;
 
-/// Most samples in one slice: two slices of f64 are in memory while a surface is made.
-pub const MAX_SLICE_SAMPLES: u64 = 1 << 26;
+/// Most samples in one slice: 4096 x 4096. Two slices of f64 are in memory while a surface is made, 256 MiB of these.
+pub const MAX_SLICE_SAMPLES: u64 = 1 << 24;
 
 /// What a volume is.
 #[derive(Clone, Debug, PartialEq)]

@@ -22,6 +22,8 @@ impl Folder {
     }
     pub(super) fn write(&self, name: &str, content: &[u8]) -> PathBuf {
         let path = self.path().join(name);
+        // some file systems flush a file that is truncated and written again
+        let _ = std::fs::remove_file(&path);
         std::fs::write(&path, content).unwrap();
         path
     }
