@@ -1,4 +1,15 @@
 //! Rays in motion: stores, wire formats, planning, rounds, the local run.
 
+pub mod flight;
+pub mod job;
+pub mod ledger;
+pub mod local;
+pub mod plan;
+pub mod report;
+pub mod resident;
 pub mod store;
+pub mod task;
+#[cfg(test)]
+mod testing;
+pub mod wave;
 pub mod wire;

@@ -1,0 +1,11 @@
+//! A job: its settings, who watches it, how it is run to its end.
+
+mod error;
+mod progress;
+mod scene;
+mod settings;
+
+pub use error::JobError;
+pub use progress::{Image, Progress, Silent, Status};
+pub use scene::PreparedScene;
+pub use settings::{JobSettings, NodeSpec, Sampling};

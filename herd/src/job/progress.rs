@@ -1,0 +1,54 @@
+//! What a running job tells whoever watches.
+
+use std::time::Duration;
+
+use crate::report::RayCounts;
+
+/// How far a job is.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Status {
+    /// Since the start.
+    pub elapsed: Duration,
+    /// Rays of committed tasks.
+    pub rays: RayCounts,
+    /// Camera samples started by committed tasks.
+    pub samples: u64,
+    /// Camera samples that there will be, unless a target error or a time limit ends the job before.
+    pub samples_total: u64,
+    /// Rays that wait in groups.
+    pub waiting: u64,
+    /// Rounds (commits) so far.
+    pub rounds: u64,
+    /// Estimated relMSE at the last complete step, if there was one.
+    pub error: Option<f64>,
+}
+
+/// An unfinished or finished picture: linear RGB, row by row from the top.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Image {
+    /// Pixels in a row.
+    pub width: u32,
+    /// Rows.
+    pub height: u32,
+    /// `width * height` pixels.
+    pub pixels: Vec<[f32; 3]>,
+}
+
+/// Watches a job. Calls come from the thread that runs it, between commits; they should return soon.
+pub trait Progress: Send + Sync {
+    /// After each commit, and some times a second while tasks run.
+    fn status(&self, status: &Status);
+    /// Whether a preview is wanted now; asked after a commit.
+    fn wants_preview(&self) -> bool {
+        false
+    }
+    /// The image so far.
+    fn preview(&self, _image: &Image) {}
+}
+
+/// Nobody watches.
+pub struct Silent;
+
+impl Progress for Silent {
+    fn status(&self, _: &Status) {}
+}

@@ -1,0 +1,81 @@
+//! A prepared scene, opened: what every task of a job shares.
+
+use std::sync::Arc;
+
+use rayherd_render::film::TILE;
+use rayherd_render::frame::Frame;
+use rayherd_render::light::Lights;
+use rayherd_render::path::Context;
+use rayherd_render::ray::Ray;
+use rayherd_render::world::World;
+use rayherd_scene::grid::Grid;
+use rayherd_scene::manifest::Manifest;
+use rayherd_scene::objects::ObjectStore;
+
+use super::JobError;
+
+/// A prepared scene with its small parts in memory: world, lights, grid. Blocks stay in the store.
+pub struct PreparedScene {
+    /// What it is made of.
+    pub manifest: Manifest,
+    /// Materials, shapes, emitters.
+    pub world: World,
+    /// Tables over the emitters.
+    pub lights: Lights,
+    /// Who owns which cell.
+    pub grid: Grid,
+    /// Where the objects are.
+    pub objects: Arc<dyn ObjectStore>,
+}
+
+impl PreparedScene {
+    /// Reads the world and makes the grid ready.
+    ///
+    /// # Errors
+    /// When an object is missing or corrupt, or the manifest makes no sense.
+    pub fn open(manifest: Manifest, objects: Arc<dyn ObjectStore>) -> Result<Self, JobError> {
+        let bytes = objects.get(&manifest.world)?;
+        let malformed =
+            |e: serde_json::Error| JobError::Scene(format!("its world cannot be read: {e}; prepare it again"));
+        let world: World = serde_json::from_slice(&bytes).map_err(malformed)?;
+        if world.shapes.iter().any(|s| s.material as usize >= world.materials.len())
+            || world.emissive.iter().any(|e| e.shape as usize >= world.shapes.len())
+        {
+            return Err(JobError::Scene("its world names shapes or materials that it lacks; prepare it again".into()));
+        }
+        let lights = Lights::new(&world);
+        let grid = manifest.grid()?;
+        Ok(PreparedScene { manifest, world, lights, grid, objects })
+    }
+
+    /// Number of splits.
+    pub fn splits(&self) -> u32 {
+        self.manifest.splits.len() as u32
+    }
+    /// Memory that a split takes: geometry and attributes, bytes.
+    pub fn split_bytes(&self, split: u32) -> u64 {
+        let s = &self.manifest.splits[split as usize];
+        s.geometry.bytes + s.attributes.bytes
+    }
+    /// What every path of a frame shares.
+    pub fn context<'a>(&'a self, frame: &'a Frame) -> Context<'a> {
+        Context { world: &self.world, lights: &self.lights, frame }
+    }
+
+    /// The split where each film tile's camera rays start: the owner of the first cell on the ray through the middle of
+    /// the tile; the first split of all for a tile that looks past the scene.
+    pub fn start_splits(&self, frame: &Frame) -> Vec<u32> {
+        let [w, h] = frame.size;
+        let mut out = Vec::new();
+        for y in (0..h).step_by(TILE as usize) {
+            for x in (0..w).step_by(TILE as usize) {
+                let middle = |a: u32, end: u32| f64::from(a) + 0.5 * f64::from(TILE.min(end - a));
+                let d = frame.camera.direction(middle(x, w), middle(y, h));
+                let ray = Ray { o: frame.camera.origin, tmin: 0.0, d, tmax: f32::INFINITY };
+                let cell = self.grid.first_cell(&ray);
+                out.push(cell.and_then(|c| c.owners.first().copied()).unwrap_or(0));
+            }
+        }
+        out
+    }
+}

@@ -1,0 +1,82 @@
+//! How a job is to be run, and which image it is to make.
+
+use std::num::NonZeroU32;
+
+use rayherd_api::Strategy;
+use rayherd_render::bvh::Kernel;
+
+/// One node.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct NodeSpec {
+    /// Tasks that it runs at once.
+    pub slots: u32,
+}
+
+/// How a job runs. None of it touches a byte of the image.
+#[derive(Clone, Debug)]
+pub struct JobSettings {
+    /// Which data a task holds and which rays it gets.
+    pub strategy: Strategy,
+    /// At least one node with at least one slot.
+    pub nodes: Vec<NodeSpec>,
+    /// Scene data (geometry and attributes) that a node may hold in memory, bytes; all of it if none.
+    pub memory_per_node: Option<u64>,
+    /// Copies of each object, on as many nodes.
+    pub replicas: u32,
+    /// Whether a round ends before the next begins; the strategy's own way if none (`auto`: off, others: on).
+    pub barrier: Option<bool>,
+    /// Size of a task, seconds of one slot.
+    pub task_seconds: f64,
+    /// Threads that compute at once, whatever the slots; as many as the machine has if none.
+    pub threads: Option<NonZeroU32>,
+    /// Which code traces.
+    pub kernel: Kernel,
+    /// Rays that are traced together.
+    pub batch: u32,
+    /// Bytes of rays that a task holds before it puts some of them into a group.
+    pub ray_buffer: u64,
+    /// Seed of a schedule of faults to inject, for tests.
+    pub faults: Option<u64>,
+}
+
+impl Default for JobSettings {
+    /// One node with a slot per hardware thread and no bound on memory.
+    fn default() -> Self {
+        let threads = std::thread::available_parallelism().map_or(1, |n| n.get() as u32);
+        JobSettings {
+            strategy: Strategy::Auto,
+            nodes: vec![NodeSpec { slots: threads }],
+            memory_per_node: None,
+            replicas: 1,
+            barrier: None,
+            task_seconds: 10.0,
+            threads: None,
+            kernel: Kernel::Auto,
+            batch: 16_384,
+            ray_buffer: 64 << 20,
+            faults: None,
+        }
+    }
+}
+
+impl JobSettings {
+    /// Slots of all nodes.
+    pub fn slots(&self) -> u32 {
+        self.nodes.iter().map(|n| n.slots).sum()
+    }
+    /// Whether rounds have a barrier.
+    pub fn has_barrier(&self) -> bool {
+        self.barrier.unwrap_or(self.strategy != Strategy::Auto)
+    }
+}
+
+/// Which samples are taken, and when to stop.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Sampling {
+    /// Most samples per pixel, at most 2^24.
+    pub spp: u32,
+    /// Stop at the first step (see [`crate::wave`]) where the estimated relMSE is at most this.
+    pub target_error: Option<f64>,
+    /// Start no step of the schedule after so many seconds.
+    pub time_limit: Option<f64>,
+}

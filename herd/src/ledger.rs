@@ -1,0 +1,350 @@
+//! What counts: which rays wait, which samples are done, which attempt of which task was committed. Pure.
+//!
+//! A task takes waiting ray groups and camera units; one of its attempts is committed, the others are garbage. A
+//! commit replaces what the task took by what it made, in one step and at most once. Each commit is a [`Record`] that
+//! holds the hash of its parent, so the state is what replaying the chain of records gives; a record now and then
+//! holds the whole state ([`Snapshot`]), so that older ones, and what only they name, can be deleted.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use serde::{Deserialize, Serialize};
+
+use crate::report::RayCounts;
+use crate::wave::{CameraUnit, Done};
+
+mod chain;
+
+pub use chain::{Chain, ChainError, Fork, newest};
+
+/// Whom a ray group waits for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Destination {
+    /// A task that holds the split.
+    Split(u32),
+    /// A reduce task, which merges what the splits of one cell found.
+    Reduce(u32),
+}
+
+/// A stored ray group.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct GroupRef {
+    /// Its object.
+    pub key: String,
+    /// Whom it waits for.
+    pub to: Destination,
+    /// Rays in it.
+    pub rays: u32,
+    /// Size of the object.
+    pub bytes: u64,
+    /// Nodes that hold a copy.
+    pub holders: Vec<u32>,
+}
+
+/// A stored part of the film.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct FilmRef {
+    /// Its object.
+    pub key: String,
+    /// Size of the object.
+    pub bytes: u64,
+    /// Nodes that hold a copy.
+    pub holders: Vec<u32>,
+}
+
+/// What a task works on.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Inputs {
+    /// Keys of ray groups.
+    pub groups: Vec<String>,
+    /// Camera rays to make.
+    pub camera: Vec<CameraUnit>,
+}
+
+/// What an attempt made.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Outputs {
+    /// Rays that left.
+    pub groups: Vec<GroupRef>,
+    /// What it added to the film, if anything.
+    pub film: Option<FilmRef>,
+    /// Rays traced.
+    pub rays: RayCounts,
+    /// Contributions that were not finite or too large.
+    pub non_finite: u64,
+}
+
+/// Number of a task, never used twice in a ledger.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+pub struct TaskId(pub u64);
+
+/// One commit. Its name is the hash of its bytes.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Record {
+    /// Place in the chain, from 0.
+    pub sequence: u64,
+    /// Name of the record before; for the first one, what defines the image.
+    pub parent: String,
+    /// What it took.
+    pub took: Inputs,
+    /// What it made.
+    pub made: Outputs,
+    /// The whole state after it, if written.
+    pub snapshot: Option<Snapshot>,
+}
+
+/// The state of a ledger, but for running tasks.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Snapshot {
+    /// Sum of all committed film parts; none if there were none.
+    pub film: Option<FilmRef>,
+    /// Groups that wait.
+    pub waiting: Vec<GroupRef>,
+    /// Samples whose camera rays were made.
+    pub done: Done,
+    /// Commits so far.
+    pub commits: u64,
+    /// Rays traced so far.
+    pub rays: RayCounts,
+    /// Contributions not finite so far.
+    pub non_finite: u64,
+}
+
+/// Why the ledger refused.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum Refused {
+    /// Another task has it, or it was consumed.
+    #[error("ray group {0} does not wait")]
+    NotWaiting(String),
+    /// Those samples were made, or are being made.
+    #[error("camera rays of tile {}, samples {}..{} are taken", .0.tile, .0.first, .0.end)]
+    NotFree(CameraUnit),
+    /// It was committed or given up: the attempt is garbage.
+    #[error("task {} does not run", .0.0)]
+    NotRunning(TaskId),
+    /// A record that does not follow from the state.
+    #[error("record {sequence} does not follow: {message}")]
+    BadRecord {
+        /// Its place.
+        sequence: u64,
+        /// What does not fit.
+        message: String,
+    },
+}
+
+#[derive(Clone, Debug)]
+struct Running {
+    inputs: Vec<GroupRef>,
+    camera: Vec<CameraUnit>,
+    live: BTreeSet<u32>,
+    attempts: u32,
+}
+
+/// The state machine.
+#[derive(Clone, Debug)]
+pub struct Ledger {
+    head: String,
+    sequence: u64,
+    waiting: BTreeMap<String, GroupRef>,
+    // camera units of running tasks are in `taken`, not in `done`
+    done: Done,
+    taken: Done,
+    running: BTreeMap<TaskId, Running>,
+    next_task: u64,
+    commits: u64,
+    rays: RayCounts,
+    non_finite: u64,
+    attempts_lost: u64,
+}
+
+impl Ledger {
+    /// An empty ledger for an image, named by what defines it, of so many tiles.
+    pub fn new(image: &str, tiles: u32) -> Self {
+        Ledger {
+            head: image.to_owned(),
+            sequence: 0,
+            waiting: BTreeMap::new(),
+            done: Done::none(tiles),
+            taken: Done::none(tiles),
+            running: BTreeMap::new(),
+            next_task: 0,
+            commits: 0,
+            rays: RayCounts::default(),
+            non_finite: 0,
+            attempts_lost: 0,
+        }
+    }
+
+    /// Groups that wait and that no task has taken, by key.
+    pub fn waiting(&self) -> impl Iterator<Item = &GroupRef> {
+        self.waiting.values()
+    }
+    /// Samples made or being made.
+    pub fn taken(&self) -> &Done {
+        &self.taken
+    }
+    /// Samples whose camera rays were made by committed tasks.
+    pub fn done(&self) -> &Done {
+        &self.done
+    }
+    /// Tasks that run.
+    pub fn running(&self) -> usize {
+        self.running.len()
+    }
+    /// Rays of committed tasks.
+    pub fn rays(&self) -> RayCounts {
+        self.rays
+    }
+    /// Contributions of committed tasks that were not finite.
+    pub fn non_finite(&self) -> u64 {
+        self.non_finite
+    }
+    /// Commits in the chain.
+    pub fn commits(&self) -> u64 {
+        self.commits
+    }
+    /// Attempts that were started and did not count.
+    pub fn attempts_lost(&self) -> u64 {
+        self.attempts_lost
+    }
+    /// Whether every ray of the samples made so far has come to its end.
+    pub fn is_quiet(&self) -> bool {
+        self.waiting.is_empty() && self.running.is_empty()
+    }
+
+    /// Starts a task with attempt 0.
+    pub fn start(&mut self, inputs: &Inputs) -> Result<(TaskId, Vec<GroupRef>), Refused> {
+        let distinct: BTreeSet<&String> = inputs.groups.iter().collect();
+        if let Some(key) = inputs.groups.iter().find(|k| !self.waiting.contains_key(*k)) {
+            return Err(Refused::NotWaiting(key.clone()));
+        }
+        if distinct.len() < inputs.groups.len() {
+            return Err(Refused::NotWaiting(inputs.groups[0].clone()));
+        }
+        for (i, &unit) in inputs.camera.iter().enumerate() {
+            if !self.taken.add(unit) {
+                inputs.camera[..i].iter().for_each(|&u| self.taken.remove(u));
+                return Err(Refused::NotFree(unit));
+            }
+        }
+        let groups: Vec<GroupRef> = inputs.groups.iter().filter_map(|k| self.waiting.remove(k)).collect();
+        let id = TaskId(self.next_task);
+        self.next_task += 1;
+        self.running.insert(
+            id,
+            Running { inputs: groups.clone(), camera: inputs.camera.clone(), live: BTreeSet::from([0]), attempts: 1 },
+        );
+        Ok((id, groups))
+    }
+
+    /// Starts one more attempt of a running task; its number.
+    pub fn again(&mut self, id: TaskId) -> Result<u32, Refused> {
+        let task = self.running.get_mut(&id).ok_or(Refused::NotRunning(id))?;
+        let attempt = task.attempts;
+        task.attempts += 1;
+        task.live.insert(attempt);
+        Ok(attempt)
+    }
+
+    /// An attempt will not report. When it was the last one, the task is given up and its inputs wait again: true.
+    pub fn lost(&mut self, id: TaskId, attempt: u32) -> bool {
+        let Some(task) = self.running.get_mut(&id) else { return false };
+        if !task.live.remove(&attempt) {
+            return false;
+        }
+        self.attempts_lost += 1;
+        if !task.live.is_empty() {
+            return false;
+        }
+        let task = self.running.remove(&id).expect("it was found above");
+        self.waiting.extend(task.inputs.into_iter().map(|g| (g.key.clone(), g)));
+        task.camera.into_iter().for_each(|u| self.taken.remove(u));
+        true
+    }
+
+    /// What the commit of a task would be recorded as. The record must be durable before [`Ledger::commit`].
+    pub fn record(&self, id: TaskId, made: Outputs) -> Result<Record, Refused> {
+        let task = self.running.get(&id).ok_or(Refused::NotRunning(id))?;
+        let took = Inputs { groups: task.inputs.iter().map(|g| g.key.clone()).collect(), camera: task.camera.clone() };
+        Ok(Record { sequence: self.sequence, parent: self.head.clone(), took, made, snapshot: None })
+    }
+
+    /// The state that a snapshot in `record` must hold, with the film of all commits up to it.
+    pub fn snapshot_after(&self, record: &Record, film: Option<FilmRef>) -> Snapshot {
+        let mut done = self.done.clone();
+        let mut rays = self.rays;
+        record.took.camera.iter().for_each(|&u| {
+            done.add(u);
+        });
+        rays.merge(&record.made.rays);
+        // what running tasks hold is not consumed yet: it waits, for whoever resumes
+        let held = self.running.values().flat_map(|t| &t.inputs);
+        let gone: BTreeSet<&String> = record.took.groups.iter().collect();
+        let mut waiting: Vec<GroupRef> =
+            self.waiting.values().chain(held).filter(|g| !gone.contains(&g.key)).cloned().collect();
+        waiting.extend(record.made.groups.iter().cloned());
+        waiting.sort_by(|a, b| a.key.cmp(&b.key));
+        let non_finite = self.non_finite + record.made.non_finite;
+        Snapshot { film, waiting, done, commits: self.commits + 1, rays, non_finite }
+    }
+
+    /// Commits a running task by its (durable) record; `name` is the record's hash. Other attempts become garbage.
+    pub fn commit(&mut self, id: TaskId, record: &Record, name: String) -> Result<(), Refused> {
+        let task = self.running.get(&id).ok_or(Refused::NotRunning(id))?;
+        if record.parent != self.head || record.sequence != self.sequence {
+            return Err(bad(record, "its parent is not the newest record"));
+        }
+        self.attempts_lost += task.live.len() as u64 - 1;
+        let task = self.running.remove(&id).expect("it was found above");
+        for unit in task.camera {
+            self.done.add(unit);
+        }
+        self.follow(record, name);
+        Ok(())
+    }
+
+    /// Applies the next record of a chain that is replayed. No task may run.
+    pub fn replay(&mut self, record: &Record, name: String) -> Result<(), Refused> {
+        if let Some(s) = &record.snapshot {
+            // a snapshot stands for all records up to its own
+            self.waiting = s.waiting.iter().map(|g| (g.key.clone(), g.clone())).collect();
+            self.done = s.done.clone();
+            self.taken = s.done.clone();
+            (self.commits, self.rays, self.non_finite) = (s.commits, s.rays, s.non_finite);
+            (self.head, self.sequence) = (name, record.sequence + 1);
+            return Ok(());
+        }
+        if record.parent != self.head || record.sequence != self.sequence {
+            return Err(bad(record, "its parent is not the record before"));
+        }
+        if let Some(key) = record.took.groups.iter().find(|k| !self.waiting.contains_key(*k)) {
+            return Err(bad(record, &format!("it consumes {key}, which does not wait")));
+        }
+        for &unit in &record.took.camera {
+            if !self.done.add(unit) || !self.taken.add(unit) {
+                return Err(bad(record, "it makes camera rays a second time"));
+            }
+        }
+        record.took.groups.iter().for_each(|k| {
+            self.waiting.remove(k);
+        });
+        self.follow(record, name);
+        Ok(())
+    }
+
+    fn follow(&mut self, record: &Record, name: String) {
+        self.waiting.extend(record.made.groups.iter().map(|g| (g.key.clone(), g.clone())));
+        self.rays.merge(&record.made.rays);
+        self.non_finite += record.made.non_finite;
+        self.commits += 1;
+        self.sequence += 1;
+        self.head = name;
+    }
+}
+
+fn bad(record: &Record, message: &str) -> Refused {
+    Refused::BadRecord { sequence: record.sequence, message: message.to_owned() }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,353 @@
+//! One attempt of a task, on the thread of a slot.
+
+use std::collections::BTreeMap;
+
+use rayherd_render::film::FilmPart;
+use rayherd_render::frame::Frame;
+use rayherd_render::path::{Context, Outcome, PathRay, Surface, Surfaces, shade};
+use rayherd_render::ray::Hit;
+use rayherd_scene::grid::SplitSet;
+
+use super::nodes::Nodes;
+use crate::flight::{Flights, PathFlight, ShadowFlight, Visit};
+use crate::job::{JobError, JobSettings, PreparedScene};
+use crate::ledger::{Destination, FilmRef, GroupRef, Outputs};
+use crate::plan::Set;
+use crate::report::Kind;
+use crate::resident::{Lease, Resident};
+use crate::task::codec;
+use crate::task::groups::{GroupSink, Groups};
+use crate::task::{CameraFeed, Loop, Outbox, Stop};
+use crate::wave::CameraUnit;
+
+/// What an attempt works on.
+#[derive(Clone, Debug)]
+pub struct Attempt {
+    /// Name of its objects.
+    pub name: String,
+    /// Where it runs.
+    pub node: u32,
+    /// With what data.
+    pub set: Set,
+    /// Rays to trace.
+    pub groups: Vec<GroupRef>,
+    /// Camera rays to make.
+    pub camera: Vec<CameraUnit>,
+}
+
+/// What an attempt made.
+pub struct Made {
+    /// To be committed.
+    pub outputs: Outputs,
+    /// Its part of the film.
+    pub film: FilmPart,
+    /// Rays that left the split set.
+    pub hops: u64,
+}
+
+/// What all attempts share.
+pub struct Shared<'a> {
+    /// The scene.
+    pub scene: &'a PreparedScene,
+    /// The picture.
+    pub frame: &'a Frame,
+    /// How the job runs.
+    pub settings: &'a JobSettings,
+    /// The nodes.
+    pub nodes: Nodes<'a>,
+    /// Whether film parts are stored (else they are handed over in memory only).
+    pub store_film: bool,
+    /// Number of buckets of the reduce step.
+    pub buckets: u32,
+}
+
+impl Shared<'_> {
+    fn context(&self) -> Context<'_> {
+        self.scene.context(self.frame)
+    }
+    fn lease<'n>(&'n self, node: u32, set: &[u32]) -> Result<Lease<'n>, JobError> {
+        let blocks = self.nodes.blocks(node);
+        let bytes = set.iter().map(|&s| self.scene.split_bytes(s)).sum();
+        let lease = self.nodes.memory(node).acquire(set, bytes, || Resident::load(self.scene, set, &blocks))?;
+        if lease.warm {
+            blocks.count_warm(set);
+        }
+        Ok(lease)
+    }
+}
+
+struct Store<'a> {
+    shared: &'a Shared<'a>,
+    attempt: &'a Attempt,
+}
+
+impl GroupSink for Store<'_> {
+    fn store(&self, to: Destination, number: u32, rays: &Flights) -> Result<GroupRef, JobError> {
+        let key = format!("rays/{}-{number}", self.attempt.name);
+        let body = codec::encode_rays(self.shared.frame, rays);
+        let bytes = body.len() as u64;
+        let holders = self.shared.nodes.put(self.attempt.node, Kind::Rays, &key, body)?;
+        Ok(GroupRef { key, to, rays: rays.len() as u32, bytes, holders })
+    }
+}
+
+/// Runs an attempt to its end.
+pub fn run(shared: &Shared, attempt: &Attempt, stop: &dyn Stop) -> Result<Made, JobError> {
+    let sink = Store { shared, attempt };
+    let mut groups = Groups::new(&sink, shared.settings.ray_buffer);
+    let mut film = FilmPart::new(shared.frame.size);
+    let mut camera = CameraFeed::new(shared.frame, attempt.camera.clone());
+    let mut trace = Loop::new(shared.settings.kernel, shared.settings.batch as usize)?;
+    let mut task = Task { shared, attempt, stop, trace: &mut trace, camera: &mut camera, film: &mut film };
+    match &attempt.set {
+        Set::Resident(set) => task.resident(set, &mut groups)?,
+        Set::Any => task.any()?,
+        Set::Sharing(split) => task.sharing(*split, &mut groups)?,
+        Set::Reduce => task.reduce(&mut groups)?,
+    }
+    let hops = if attempt.set == Set::Reduce { 0 } else { groups.rays };
+    let rays = trace.rays;
+    let groups = groups.finish()?;
+    let non_finite = film.rejected().count;
+    let film_ref = if shared.store_film && (film.touched() > 0 || non_finite > 0) {
+        let key = format!("film/{}", attempt.name);
+        let body = codec::encode_film(&film);
+        let bytes = body.len() as u64;
+        let holders = shared.nodes.put(attempt.node, Kind::Film, &key, body)?;
+        Some(FilmRef { key, bytes, holders })
+    } else {
+        None
+    };
+    Ok(Made { outputs: Outputs { groups, film: film_ref, rays, non_finite }, film, hops })
+}
+
+struct Task<'a, 'f> {
+    shared: &'a Shared<'a>,
+    attempt: &'a Attempt,
+    stop: &'a dyn Stop,
+    trace: &'a mut Loop,
+    camera: &'a mut CameraFeed<'f>,
+    film: &'a mut FilmPart,
+}
+
+impl Task<'_, '_> {
+    /// Hands the input rays over, some batches at a time, and at last once without any, for the camera rays.
+    fn inputs(&mut self, mut each: impl FnMut(&mut Self, Flights) -> Result<(), JobError>) -> Result<(), JobError> {
+        let least = 4 * self.shared.settings.batch as usize;
+        let mut flights = Flights::default();
+        for group in &self.attempt.groups {
+            let open = |body: &bytes::Bytes| codec::decode_rays(self.shared.frame, body);
+            let mut rays = self.shared.nodes.get(self.attempt.node, Kind::Rays, &group.key, &group.holders, open)?;
+            flights.append(&mut rays);
+            if flights.len() >= least {
+                each(self, std::mem::take(&mut flights))?;
+            }
+        }
+        each(self, flights)
+    }
+
+    fn resident(&mut self, set: &[u32], groups: &mut Groups) -> Result<(), JobError> {
+        let (shared, node, stop) = (self.shared, self.attempt.node, self.stop);
+        let lease = shared.lease(node, set)?;
+        let blocks = shared.nodes.blocks(node);
+        let surfaces = lease.surfaces(shared.scene, &blocks)?;
+        let (context, grid) = (shared.context(), &shared.scene.grid);
+        self.inputs(|t, mut flights| {
+            if lease.is_complete() {
+                t.trace.run_complete(&context, &lease, &surfaces, &mut flights, t.camera, t.film, stop)
+            } else {
+                t.trace.run(&context, grid, &lease, &surfaces, &mut flights, t.camera, t.film, groups, stop)
+            }
+        })
+    }
+
+    /// Demand driven: rays wait in the task for the splits that they need, which come and go one after the other.
+    fn any(&mut self) -> Result<(), JobError> {
+        let (shared, node, stop) = (self.shared, self.attempt.node, self.stop);
+        let (context, grid) = (shared.context(), &shared.scene.grid);
+        let limit = (shared.settings.ray_buffer / size_of::<PathFlight>() as u64).max(1) as usize;
+        let mut queues = Queues::default();
+        let mut none = CameraFeed::new(shared.frame, Vec::new());
+        let mut missed = Outcome::default();
+        self.inputs(|t, flights| {
+            queues.route(shared, flights)?;
+            let mut made: Vec<PathRay> = Vec::new();
+            loop {
+                while queues.len() < limit {
+                    made.clear();
+                    t.camera.fill(&mut made, shared.settings.batch as usize);
+                    if made.is_empty() {
+                        break;
+                    }
+                    t.trace.count_camera(made.len() as u64, &context);
+                    for &ray in &made {
+                        match Visit::START.next(grid, &ray.ray(), &SplitSet::default()) {
+                            Some((to, visit)) => queues.path(to, PathFlight { visit, ..PathFlight::new(ray) })?,
+                            None => miss(&context, ray, &mut missed, t.film),
+                        }
+                    }
+                }
+                let Some((split, mut flights)) = queues.fullest() else { return Ok(()) };
+                let lease = shared.lease(node, &[split])?;
+                let blocks = shared.nodes.blocks(node);
+                let surfaces = lease.surfaces(shared.scene, &blocks)?;
+                t.trace.run(&context, grid, &lease, &surfaces, &mut flights, &mut none, t.film, &mut queues, stop)?;
+            }
+        })
+    }
+
+    /// The scheduling grid without overlap reduction: a cell may have several owners, so rays are tested against all
+    /// splits that share a cell with the chosen one, and a reduce step decides on the nearest hit.
+    fn sharing(&mut self, split: u32, groups: &mut Groups) -> Result<(), JobError> {
+        let (shared, node, stop) = (self.shared, self.attempt.node, self.stop);
+        let (context, grid) = (shared.context(), &shared.scene.grid);
+        let together = grid.sharing(split);
+        let set: SplitSet = together.iter().copied().collect();
+        let limit = (shared.settings.ray_buffer / size_of::<PathFlight>() as u64).max(1) as usize;
+        self.inputs(|t, mut flights| {
+            loop {
+                let room = limit.saturating_sub(flights.paths.len());
+                let mut made: Vec<PathRay> = Vec::new();
+                t.camera.fill(&mut made, room);
+                t.trace.count_camera(made.len() as u64, &context);
+                flights.paths.extend(made.iter().map(|&r| PathFlight::new(r)));
+                if flights.is_empty() {
+                    return Ok(());
+                }
+                t.shade_decided(split, &context, &mut flights)?;
+                for &s in &together {
+                    let lease = shared.lease(node, &[s])?;
+                    for batch in flights.paths.chunks_mut(shared.settings.batch as usize) {
+                        stop.check()?;
+                        t.trace.closest(&lease, batch);
+                    }
+                    for batch in std::mem::take(&mut flights.shadows).chunks(shared.settings.batch as usize) {
+                        stop.check()?;
+                        t.trace.unoccluded(&lease, batch, &mut flights.shadows);
+                    }
+                }
+                for flight in flights.paths.drain(..) {
+                    let ray = rayherd_render::ray::Ray { tmax: flight.candidate.t, ..flight.ray.ray() };
+                    let next = flight.visit.next(grid, &ray, &set);
+                    let visit = next.map_or(Visit::DECIDED, |n| n.1);
+                    let bucket = flight.ray.key.pixel % shared.buckets;
+                    groups.add_path(Destination::Reduce(bucket), PathFlight { visit, ..flight })?;
+                }
+                for flight in flights.shadows.drain(..) {
+                    match flight.visit.next(grid, &flight.ray.ray(), &set) {
+                        Some((to, visit)) => groups.shadow(to, ShadowFlight { visit, ..flight })?,
+                        None => {
+                            let light = flight.ray.light();
+                            t.film.add(light.pixel, light.sample, light.value);
+                        }
+                    }
+                }
+            }
+        })
+    }
+
+    /// Shades the rays whose hit was decided, in the split that holds it; what they spawn takes their place.
+    fn shade_decided(&mut self, split: u32, context: &Context, flights: &mut Flights) -> Result<(), JobError> {
+        let (mut decided, undecided): (Vec<PathFlight>, Vec<PathFlight>) =
+            std::mem::take(&mut flights.paths).into_iter().partition(|f| f.visit == Visit::DECIDED);
+        flights.paths = undecided;
+        if decided.is_empty() {
+            return Ok(());
+        }
+        let lease = self.shared.lease(self.attempt.node, &[split])?;
+        let blocks = self.shared.nodes.blocks(self.attempt.node);
+        let surfaces = lease.surfaces(self.shared.scene, &blocks)?;
+        for batch in decided.chunks_mut(self.shared.settings.batch as usize) {
+            self.stop.check()?;
+            self.trace.shade_decided(context, &lease, &surfaces, batch, flights, self.film)?;
+        }
+        Ok(())
+    }
+
+    /// Merges what map tasks found: of each ray the nearest candidate; it goes on to the next cell, or to its hit.
+    fn reduce(&mut self, groups: &mut Groups) -> Result<(), JobError> {
+        let (shared, context) = (self.shared, self.shared.context());
+        let mut missed = Outcome::default();
+        self.inputs(|t, mut flights| {
+            flights.paths.sort_by_key(|f| (f.ray.key, f.candidate.t.to_bits(), f.candidate.prim));
+            flights.paths.dedup_by_key(|f| f.ray.key);
+            for flight in flights.paths.drain(..) {
+                if let Some(cell) = flight.visit.progress.0.checked_sub(1) {
+                    let owners = shared.scene.grid.owners(cell);
+                    let to = owners.get(usize::from(flight.visit.owner)).copied();
+                    let to = to.ok_or_else(|| JobError::Internal("a ray waits for an owner that is none".into()))?;
+                    groups.path(to, flight)?;
+                } else if flight.candidate.is_hit() {
+                    groups.path(flight.candidate.split, flight)?;
+                } else {
+                    miss(&context, flight.ray, &mut missed, t.film);
+                }
+            }
+            Ok(())
+        })
+    }
+}
+
+/// Nothing is there to be hit.
+struct NoSurfaces;
+
+impl Surfaces for NoSurfaces {
+    fn surface(&self, _: usize, _: &Hit) -> Surface {
+        unreachable!("a miss has no surface")
+    }
+}
+
+/// Ends a path that leaves the scene.
+fn miss(context: &Context, ray: PathRay, out: &mut Outcome, film: &mut FilmPart) {
+    out.clear();
+    shade(context, &NoSurfaces, &[ray], &[Hit::miss(f32::INFINITY)], out);
+    out.light.iter().for_each(|l| film.add(l.pixel, l.sample, l.value));
+}
+
+/// Rays that wait inside a task, by split.
+#[derive(Default)]
+struct Queues {
+    waiting: BTreeMap<u32, Flights>,
+    len: usize,
+}
+
+impl Queues {
+    fn len(&self) -> usize {
+        self.len
+    }
+    /// The split with most rays, with them.
+    fn fullest(&mut self) -> Option<(u32, Flights)> {
+        let (&split, _) = self.waiting.iter().max_by_key(|(s, f)| (f.len(), std::cmp::Reverse(**s)))?;
+        let flights = self.waiting.remove(&split)?;
+        self.len -= flights.len();
+        Some((split, flights))
+    }
+    /// Rays from elsewhere, which wait for the cell that they were sent to, or for their hit's attributes.
+    fn route(&mut self, shared: &Shared, mut flights: Flights) -> Result<(), JobError> {
+        let owner = |visit: Visit, decided: u32| match visit.progress.0.checked_sub(1) {
+            Some(cell) => shared.scene.grid.owners(cell).get(usize::from(visit.owner)).copied(),
+            None => Some(decided),
+        };
+        let lost = || JobError::Internal("a ray waits for an owner that is none".into());
+        for flight in flights.paths.drain(..) {
+            self.path(owner(flight.visit, flight.candidate.split).ok_or_else(lost)?, flight)?;
+        }
+        for flight in flights.shadows.drain(..) {
+            self.shadow(owner(flight.visit, u32::MAX).filter(|&s| s != u32::MAX).ok_or_else(lost)?, flight)?;
+        }
+        Ok(())
+    }
+}
+
+impl Outbox for Queues {
+    fn path(&mut self, to: u32, flight: PathFlight) -> Result<(), JobError> {
+        self.waiting.entry(to).or_default().paths.push(flight);
+        self.len += 1;
+        Ok(())
+    }
+    fn shadow(&mut self, to: u32, flight: ShadowFlight) -> Result<(), JobError> {
+        self.waiting.entry(to).or_default().shadows.push(flight);
+        self.len += 1;
+        Ok(())
+    }
+}

@@ -1,0 +1,71 @@
+//! Camera units that were not handed out yet, by the split where they start.
+
+use std::collections::{BTreeMap, VecDeque};
+use std::ops::Range;
+
+use rayherd_render::frame::Frame;
+
+use crate::task::camera::tile_pixels;
+use crate::wave::{CameraUnit, Done};
+
+/// Most samples of a unit, so that a unit is a small part of a task.
+const UNIT_SAMPLES: u32 = 256;
+
+/// Queues of units, in the order in which steps were added.
+pub struct Cameras {
+    /// Split where each tile's rays start.
+    starts: Vec<u32>,
+    /// Pixels of each tile.
+    pixels: Vec<u64>,
+    queues: BTreeMap<u32, VecDeque<(u64, CameraUnit)>>,
+    added: u64,
+}
+
+impl Cameras {
+    /// Empty queues.
+    pub fn new(frame: &Frame, starts: Vec<u32>) -> Self {
+        let pixels = (0..starts.len() as u32).map(|t| u64::from(tile_pixels(frame, t))).collect();
+        Cameras { starts, pixels, queues: BTreeMap::new(), added: 0 }
+    }
+    /// Adds what of the samples was not taken.
+    pub fn add(&mut self, samples: Range<u32>, taken: &Done) {
+        for first in samples.clone().step_by(UNIT_SAMPLES as usize) {
+            let part = first..first.saturating_add(UNIT_SAMPLES).min(samples.end);
+            for tile in 0..self.starts.len() as u32 {
+                for unit in taken.missing(tile, &part) {
+                    self.push_back(unit);
+                }
+            }
+        }
+    }
+    /// Camera rays by start split.
+    pub fn rays(&self) -> BTreeMap<u32, u64> {
+        let sum = |q: &VecDeque<(u64, CameraUnit)>| q.iter().map(|(_, u)| self.unit_rays(u)).sum();
+        self.queues.iter().filter(|(_, q)| !q.is_empty()).map(|(&s, q)| (s, sum(q))).collect()
+    }
+    /// Whether there are none left.
+    pub fn is_empty(&self) -> bool {
+        self.queues.values().all(VecDeque::is_empty)
+    }
+    /// Takes units, oldest first, until there are about `rays` rays, of the given start splits (of all if none are given).
+    pub fn take(&mut self, rays: u64, from: &[u32]) -> Vec<CameraUnit> {
+        let mut out = Vec::new();
+        let mut sum = 0;
+        while sum < rays.max(1) {
+            let fronts = self.queues.iter().filter(|(s, _)| from.is_empty() || from.contains(s));
+            let oldest = fronts.filter_map(|(&s, q)| q.front().map(|f| (f.0, s))).min();
+            let Some(unit) = oldest.and_then(|(_, s)| self.queues.get_mut(&s)?.pop_front()) else { break };
+            sum += self.unit_rays(&unit.1);
+            out.push(unit.1);
+        }
+        out
+    }
+
+    fn push_back(&mut self, unit: CameraUnit) {
+        self.added += 1;
+        self.queues.entry(self.starts[unit.tile as usize]).or_default().push_back((self.added, unit));
+    }
+    fn unit_rays(&self, unit: &CameraUnit) -> u64 {
+        self.pixels[unit.tile as usize] * u64::from(unit.end - unit.first)
+    }
+}

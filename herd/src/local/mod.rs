@@ -1,0 +1,80 @@
+//! An executor with virtual nodes, in one process.
+
+pub mod attempt;
+mod cameras;
+mod driver;
+pub mod nodes;
+mod slots;
+#[cfg(test)]
+mod tests;
+mod usage;
+
+use rayherd_render::film::FilmPart;
+use rayherd_render::frame::Frame;
+
+use crate::job::{Image, JobError, JobSettings, PreparedScene, Progress, Sampling};
+use crate::report::Report;
+
+/// What a job made.
+pub struct JobOutcome {
+    /// The picture.
+    pub image: Image,
+    /// Its exact sums.
+    pub film: FilmPart,
+    /// Samples per pixel in it.
+    pub spp: u32,
+    /// What was done and counted.
+    pub report: Report,
+}
+
+/// Renders a frame of a prepared scene on virtual nodes in this process.
+///
+/// The image is a function of (scene, frame, samples) alone, to the byte: not of the settings, not of time.
+///
+/// # Errors
+/// When settings, scene or store do not allow it; see [`JobError`].
+pub fn render_local(
+    scene: &PreparedScene,
+    frame: &Frame,
+    sampling: &Sampling,
+    settings: &JobSettings,
+    progress: &dyn Progress,
+) -> Result<JobOutcome, JobError> {
+    driver::render(scene, frame, sampling, settings, progress)
+}
+
+/// Checks what can be checked before anything is read.
+fn check(scene: &PreparedScene, frame: &Frame, sampling: &Sampling, settings: &JobSettings) -> Result<(), JobError> {
+    frame.check()?;
+    let refuse = |message: String| Err(JobError::Settings(message));
+    if sampling.spp == 0 || sampling.spp > crate::wave::MAX_SPP {
+        return refuse(format!("{} samples per pixel: give 1 to {}", sampling.spp, crate::wave::MAX_SPP));
+    }
+    if sampling.target_error.is_some_and(|e| e.is_nan() || e <= 0.0) {
+        return refuse("the target error must be above 0".into());
+    }
+    if sampling.time_limit.is_some_and(|t| t.is_nan() || t < 0.0) {
+        return refuse("the time limit must be 0 or more seconds".into());
+    }
+    if settings.nodes.is_empty() || settings.nodes.iter().any(|n| n.slots == 0) {
+        return refuse("give at least one node, each with at least one slot".into());
+    }
+    if settings.nodes.len() > 1000 || settings.slots() > 10_000 {
+        return refuse("at most 1000 nodes and 10000 slots run in one process".into());
+    }
+    let nodes = settings.nodes.len() as u32;
+    if settings.replicas == 0 || settings.replicas > nodes {
+        return refuse(format!("{} copies on {nodes} node(s): give 1 to {nodes} replicas", settings.replicas));
+    }
+    if !(settings.task_seconds > 0.0 && settings.task_seconds.is_finite()) {
+        return refuse("the size of a task must be above 0 seconds".into());
+    }
+    if settings.batch == 0 {
+        return refuse("a batch has at least one ray".into());
+    }
+    let needed = (0..scene.splits()).map(|s| scene.split_bytes(s)).max().unwrap_or(0);
+    match settings.memory_per_node {
+        Some(given) if given < needed => Err(JobError::Memory { needed, given }),
+        _ => Ok(()),
+    }
+}

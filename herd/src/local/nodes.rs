@@ -1,0 +1,232 @@
+//! Virtual nodes: memory, disk and network of each, with every byte counted.
+//!
+//! A node's disk is a folder of the job's store (`nodes/N/..`). Blocks of the scene stay in the store where they were
+//! prepared; which nodes count as holding a copy is kept here, and a read from another node counts as remote.
+
+use std::sync::{Arc, Mutex, PoisonError, RwLock};
+
+use bytes::Bytes as Body;
+use rayherd_scene::objects::ObjectRef;
+use tokio::runtime::Runtime;
+
+use crate::job::{JobError, JobSettings, PreparedScene};
+use crate::plan::place;
+use crate::report::{Bytes, Kind, NodeReport, Op, Place, Stage};
+use crate::resident::{Blocks, Memory};
+use crate::store::{BlockStore, StoreError};
+use crate::wire::WireError;
+
+/// All nodes.
+pub struct Nodes<'a> {
+    scene: &'a PreparedScene,
+    store: Arc<dyn BlockStore>,
+    runtime: Runtime,
+    replicas: u32,
+    memories: Vec<Memory>,
+    /// Nodes that hold a split, by split number.
+    holders: RwLock<Vec<Vec<u32>>>,
+    counts: Mutex<Counts>,
+}
+
+#[derive(Default)]
+struct Counts {
+    bytes: Bytes,
+    nodes: Vec<NodeReport>,
+}
+
+impl<'a> Nodes<'a> {
+    /// Nodes with blocks placed on them along a curve through space.
+    pub fn new(scene: &'a PreparedScene, settings: &JobSettings, store: Arc<dyn BlockStore>) -> Result<Self, JobError> {
+        let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(1).enable_all().build();
+        let runtime = runtime.map_err(|e| JobError::Internal(format!("no runtime for input and output: {e}")))?;
+        let order = place::order(&scene.manifest.splits.iter().map(|s| (s.lo, s.hi)).collect::<Vec<_>>());
+        let sizes: Vec<u64> = order.iter().map(|&s| scene.split_bytes(s)).collect();
+        let count = settings.nodes.len() as u32;
+        let mut holders = vec![Vec::new(); order.len()];
+        for (&split, on) in order.iter().zip(place::holders(&sizes, count, settings.replicas)) {
+            holders[split as usize] = on;
+        }
+        let memory = settings.memory_per_node.unwrap_or(u64::MAX);
+        let nodes = settings.nodes.iter().map(|n| NodeReport { slots: n.slots, ..NodeReport::default() }).collect();
+        Ok(Nodes {
+            scene,
+            store,
+            runtime,
+            replicas: settings.replicas.clamp(1, count),
+            memories: settings.nodes.iter().map(|_| Memory::new(memory)).collect(),
+            holders: RwLock::new(holders),
+            counts: Mutex::new(Counts { nodes, ..Counts::default() }),
+        })
+    }
+
+    /// A node's memory.
+    pub fn memory(&self, node: u32) -> &Memory {
+        &self.memories[node as usize]
+    }
+    /// Nodes that hold each split.
+    pub fn holders(&self) -> Vec<Vec<u32>> {
+        self.holders.read().unwrap_or_else(PoisonError::into_inner).clone()
+    }
+    /// The job's store.
+    pub fn store(&self) -> &Arc<dyn BlockStore> {
+        &self.store
+    }
+    /// Waits for an operation of the store.
+    pub fn wait<T>(&self, operation: impl Future<Output = T>) -> T {
+        self.runtime.block_on(operation)
+    }
+    /// Blocks as a node sees them.
+    pub fn blocks(&self, node: u32) -> NodeBlocks<'_, 'a> {
+        NodeBlocks { nodes: self, node }
+    }
+
+    /// Counts bytes that a node moved.
+    pub fn count(&self, stage: Stage, op: Op, kind: Kind, node: u32, place: Place, bytes: u64) {
+        let mut counts = self.counts.lock().unwrap_or_else(PoisonError::into_inner);
+        counts.bytes.add(stage, op, kind, place, bytes);
+        if op == Op::Read
+            && place != Place::Cache
+            && let Some(report) = counts.nodes.get_mut(node as usize)
+        {
+            report.reads += bytes;
+            if place == Place::Remote {
+                report.remote_reads += bytes;
+            }
+        }
+    }
+    /// Counts the time of a task.
+    pub fn busy(&self, node: u32, seconds: f64) {
+        self.counts.lock().unwrap_or_else(PoisonError::into_inner).nodes[node as usize].busy += seconds;
+    }
+    /// All counts.
+    pub fn report(&self) -> (Bytes, Vec<NodeReport>) {
+        let counts = self.counts.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut nodes = counts.nodes.clone();
+        for (report, memory) in nodes.iter_mut().zip(&self.memories) {
+            report.peak_scene_bytes = memory.peak();
+        }
+        (counts.bytes.clone(), nodes)
+    }
+
+    /// Stores an object on a node and on as many others as there are copies to be; the nodes that hold it.
+    pub fn put(&self, node: u32, kind: Kind, name: &str, body: Body) -> Result<Vec<u32>, JobError> {
+        let count = self.memories.len() as u32;
+        let holders: Vec<u32> = (0..self.replicas).map(|k| (node + k) % count).collect();
+        for &holder in &holders {
+            self.wait(self.store.put(&disk_key(holder, name), body.clone()))?;
+            let place = if holder == node { Place::Local } else { Place::Remote };
+            self.count(Stage::Trace, Op::Write, kind, node, place, body.len() as u64);
+        }
+        Ok(holders)
+    }
+
+    /// Reads an object, from the node itself if it holds a copy; a copy that is missing or broken is passed over.
+    ///
+    /// # Errors
+    /// [`JobError::Lost`] when no copy is whole.
+    pub fn get<T>(
+        &self,
+        node: u32,
+        kind: Kind,
+        name: &str,
+        holders: &[u32],
+        open: impl Fn(&Body) -> Result<T, WireError>,
+    ) -> Result<T, JobError> {
+        let own = holders.iter().filter(|&&h| h == node);
+        let others = holders.iter().filter(|&&h| h != node);
+        let mut why = "no node holds it".to_owned();
+        for &holder in own.chain(others) {
+            match self.wait(self.store.get(&disk_key(holder, name))) {
+                Ok(body) => {
+                    let place = if holder == node { Place::Local } else { Place::Remote };
+                    self.count(Stage::Trace, Op::Read, kind, node, place, body.len() as u64);
+                    match open(&body) {
+                        Ok(opened) => return Ok(opened),
+                        Err(e) => why = format!("copy on node {holder}: {e}"),
+                    }
+                    tracing::warn!("{name}: {why}");
+                }
+                Err(e @ (StoreError::NotFound { .. } | StoreError::Corrupt { .. })) => why = e.to_string(),
+                Err(e) => return Err(e.into()),
+            }
+        }
+        Err(JobError::Lost { name: name.to_owned(), why })
+    }
+
+    /// Deletes all copies of objects.
+    pub fn delete(&self, objects: &[(String, Vec<u32>)]) -> Result<(), JobError> {
+        let keys: Vec<String> =
+            objects.iter().flat_map(|(name, holders)| holders.iter().map(|&h| disk_key(h, name))).collect();
+        if keys.is_empty() {
+            return Ok(());
+        }
+        Ok(self.wait(self.store.delete(&keys))?)
+    }
+
+    /// A node loses its disk and its memory, and starts again empty; splits that it held are copied from others.
+    pub fn lose(&self, node: u32) -> Result<(), JobError> {
+        let keys = self.wait(self.store.list(&format!("nodes/{node}/")))?;
+        let keys: Vec<String> = keys.into_iter().map(|k| k.0).collect();
+        self.wait(self.store.delete(&keys))?;
+        self.memories[node as usize].clear();
+        let count = self.memories.len() as u32;
+        let mut holders = self.holders.write().unwrap_or_else(PoisonError::into_inner);
+        for (split, on) in holders.iter_mut().enumerate() {
+            let before = on.len();
+            on.retain(|&h| h != node);
+            // copied again, to the first node without a copy; from where the scene was prepared if there is none left
+            if on.len() < before
+                && let Some(to) = (1..=count).map(|k| (node + k) % count).find(|n| !on.contains(n))
+            {
+                on.push(to);
+                let entry = &self.scene.manifest.splits[split];
+                for (kind, bytes) in
+                    [(Kind::Geometry, entry.geometry.bytes), (Kind::Attributes, entry.attributes.bytes)]
+                {
+                    self.count(Stage::Trace, Op::Write, kind, to, Place::Remote, bytes);
+                }
+            }
+        }
+        Ok(())
+    }
+}
+
+/// Key of a node's copy of an object.
+pub fn disk_key(node: u32, name: &str) -> String {
+    format!("nodes/{node}/{name}")
+}
+
+/// Blocks of the scene, as one node reads them.
+pub struct NodeBlocks<'n, 'a> {
+    nodes: &'n Nodes<'a>,
+    node: u32,
+}
+
+impl NodeBlocks<'_, '_> {
+    fn read(&self, split: u32, kind: Kind, object: &ObjectRef) -> Result<Vec<u8>, JobError> {
+        let bytes = self.nodes.scene.objects.get(object)?;
+        let local =
+            self.nodes.holders.read().unwrap_or_else(PoisonError::into_inner)[split as usize].contains(&self.node);
+        let place = if local { Place::Local } else { Place::Remote };
+        self.nodes.count(Stage::Trace, Op::Read, kind, self.node, place, bytes.len() as u64);
+        Ok(bytes)
+    }
+    /// Counts a use of splits that are in memory already.
+    pub fn count_warm(&self, splits: &[u32]) {
+        for &split in splits {
+            let entry = &self.nodes.scene.manifest.splits[split as usize];
+            let count = |kind, bytes| self.nodes.count(Stage::Trace, Op::Read, kind, self.node, Place::Cache, bytes);
+            count(Kind::Geometry, entry.geometry.bytes);
+            count(Kind::Attributes, entry.attributes.bytes);
+        }
+    }
+}
+
+impl Blocks for NodeBlocks<'_, '_> {
+    fn geometry(&self, split: u32) -> Result<Vec<u8>, JobError> {
+        self.read(split, Kind::Geometry, &self.nodes.scene.manifest.splits[split as usize].geometry)
+    }
+    fn attributes(&self, split: u32) -> Result<Vec<u8>, JobError> {
+        self.read(split, Kind::Attributes, &self.nodes.scene.manifest.splits[split as usize].attributes)
+    }
+}

@@ -1,0 +1,276 @@
+//! The splits that a node holds in memory, and how they come and go.
+
+use std::collections::BTreeSet;
+use std::sync::{Arc, Condvar, Mutex, MutexGuard, OnceLock, PoisonError};
+
+use rayherd_render::attributes::AttributeBlock;
+use rayherd_render::bvh::Forest;
+use rayherd_render::path::{Surface, Surfaces};
+use rayherd_render::ray::Hit;
+use rayherd_scene::grid::SplitSet;
+
+use crate::job::{JobError, PreparedScene};
+
+/// Gives a split's objects to whoever loads it, and counts them.
+pub trait Blocks {
+    /// The geometry object.
+    fn geometry(&self, split: u32) -> Result<Vec<u8>, JobError>;
+    /// The attributes object.
+    fn attributes(&self, split: u32) -> Result<Vec<u8>, JobError>;
+}
+
+/// Splits in memory, ready to be traced and shaded.
+pub struct Resident {
+    splits: SplitSet,
+    /// No ray can need another split.
+    complete: bool,
+    forest: Forest,
+    /// First slot and split of each block, by ascending slot.
+    blocks: Vec<(u32, u32)>,
+    attributes: OnceLock<Vec<AttributeBlock>>,
+    /// Held while attributes are read, so that they are read once.
+    reading: Mutex<()>,
+}
+
+/// Room in a forest's arena for its top tree, a block: two trees of some 20 KiB, and alignment.
+const TOP_BYTES: u64 = 64 << 10;
+
+impl Resident {
+    /// Reads and checks the geometry of the splits.
+    pub fn load(scene: &PreparedScene, splits: &[u32], blocks: &dyn Blocks) -> Result<Self, JobError> {
+        let bytes: u64 = splits.iter().map(|&s| scene.manifest.splits[s as usize].geometry.bytes + TOP_BYTES).sum();
+        let first = splits.first().copied().unwrap_or(0);
+        let mut forest = Forest::new(bytes).map_err(|source| JobError::Forest { split: first, source })?;
+        let mut handles = Vec::with_capacity(splits.len());
+        for &split in splits {
+            let geometry = blocks.geometry(split)?;
+            let wrong = |source| JobError::Forest { split, source };
+            handles.push((forest.insert(&geometry).map_err(wrong)?, split));
+        }
+        forest.finish().map_err(|source| JobError::Forest { split: first, source })?;
+        let mut table: Vec<(u32, u32)> =
+            handles.iter().filter_map(|&(h, s)| forest.slots(h).map(|slots| (slots.start, s))).collect();
+        table.sort_unstable();
+        let set: SplitSet = splits.iter().copied().collect();
+        let complete = scene.grid.covered_by(&set);
+        let (attributes, reading) = (OnceLock::new(), Mutex::new(()));
+        Ok(Resident { splits: set, complete, forest, blocks: table, attributes, reading })
+    }
+
+    /// Which splits.
+    pub fn splits(&self) -> &SplitSet {
+        &self.splits
+    }
+    /// Whether no ray can need another split.
+    pub fn is_complete(&self) -> bool {
+        self.complete
+    }
+    /// To be traced.
+    pub fn forest(&self) -> &Forest {
+        &self.forest
+    }
+    /// The split of a slot.
+    pub fn split_of(&self, slot: u32) -> u32 {
+        self.blocks[self.block_of(slot)].1
+    }
+    /// To be shaded: reads the attributes when they are asked for first.
+    pub fn surfaces(&self, scene: &PreparedScene, blocks: &dyn Blocks) -> Result<ResidentSurfaces<'_>, JobError> {
+        if self.attributes.get().is_none() {
+            let _one = lock(&self.reading);
+            if self.attributes.get().is_none() {
+                let read = self.blocks.iter().map(|&(_, split)| {
+                    let entry = &scene.manifest.splits[split as usize];
+                    let bytes = blocks.attributes(split)?;
+                    let block = AttributeBlock::decode(&bytes, (entry.triangles + entry.spheres) as u32)
+                        .map_err(|source| JobError::Attributes { split, source })?;
+                    if block.shapes.iter().any(|&s| s as usize >= scene.world.shapes.len()) {
+                        return Err(JobError::Scene(format!("split {split} names a shape that the world lacks")));
+                    }
+                    Ok(block)
+                });
+                let read: Vec<AttributeBlock> = read.collect::<Result<_, JobError>>()?;
+                // nobody else sets it: `reading` is held
+                let _ = self.attributes.set(read);
+            }
+        }
+        let attributes = self.attributes.get().ok_or_else(|| JobError::Internal("attributes vanished".into()))?;
+        Ok(ResidentSurfaces { resident: self, attributes })
+    }
+
+    fn block_of(&self, slot: u32) -> usize {
+        if self.blocks.len() == 1 { 0 } else { self.blocks.partition_point(|b| b.0 <= slot) - 1 }
+    }
+}
+
+/// Surfaces of resident splits.
+pub struct ResidentSurfaces<'a> {
+    resident: &'a Resident,
+    attributes: &'a [AttributeBlock],
+}
+
+impl Surfaces for ResidentSurfaces<'_> {
+    #[inline]
+    fn surface(&self, _index: usize, hit: &Hit) -> Surface {
+        let forest = &self.resident.forest;
+        let block = self.resident.block_of(hit.prim);
+        let local = (hit.prim - self.resident.blocks[block].0) as usize;
+        let attributes = &self.attributes[block];
+        // zeros: this one has none
+        let normals = attributes.normals.get(local).copied().filter(|n| n.as_flattened().iter().any(|&x| x != 0.0));
+        Surface {
+            prim: forest.prim_id(hit.prim),
+            shape: attributes.shapes[local],
+            geometry: forest.primitive(hit),
+            normals,
+            uv: attributes.uvs.get(local).copied(),
+        }
+    }
+}
+
+/// The memory of a node: sets of splits that tasks share, within a budget. What no task uses stays until its room is
+/// needed.
+pub struct Memory {
+    capacity: u64,
+    state: Mutex<State>,
+    changed: Condvar,
+}
+
+#[derive(Default)]
+struct State {
+    held: Vec<Held>,
+    clock: u64,
+    peak: u64,
+}
+
+struct Held {
+    set: Vec<u32>,
+    bytes: u64,
+    users: u32,
+    used_at: u64,
+    /// None while it is being loaded.
+    resident: Option<Arc<Resident>>,
+}
+
+/// A use of resident splits; they stay in memory as long as it lives.
+pub struct Lease<'a> {
+    memory: &'a Memory,
+    resident: Arc<Resident>,
+    set: Vec<u32>,
+    /// Whether they were in memory already.
+    pub warm: bool,
+}
+
+impl std::ops::Deref for Lease<'_> {
+    type Target = Resident;
+    fn deref(&self) -> &Resident {
+        &self.resident
+    }
+}
+
+impl Drop for Lease<'_> {
+    fn drop(&mut self) {
+        let mut state = lock(&self.memory.state);
+        if let Some(held) = state.held.iter_mut().find(|h| h.set == self.set) {
+            held.users -= 1;
+        }
+        self.memory.changed.notify_all();
+    }
+}
+
+impl Memory {
+    /// Memory for so many bytes of splits.
+    pub fn new(capacity: u64) -> Self {
+        Memory { capacity, state: Mutex::default(), changed: Condvar::new() }
+    }
+    /// What it may hold.
+    pub fn capacity(&self) -> u64 {
+        self.capacity
+    }
+    /// The most that it held at once.
+    pub fn peak(&self) -> u64 {
+        lock(&self.state).peak
+    }
+    /// The splits that it holds, or is loading.
+    pub fn warm(&self) -> BTreeSet<u32> {
+        lock(&self.state).held.iter().flat_map(|h| h.set.iter().copied()).collect()
+    }
+    /// Forgets everything that no task uses.
+    pub fn clear(&self) {
+        lock(&self.state).held.retain(|h| h.users > 0);
+        self.changed.notify_all();
+    }
+
+    /// The splits (ascending, of so many bytes), loaded unless they are there. Waits while other tasks need the room.
+    ///
+    /// # Errors
+    /// When they take more than there is, or loading fails.
+    pub fn acquire(
+        &self,
+        set: &[u32],
+        bytes: u64,
+        load: impl FnOnce() -> Result<Resident, JobError>,
+    ) -> Result<Lease<'_>, JobError> {
+        if bytes > self.capacity {
+            return Err(JobError::Memory { needed: bytes, given: self.capacity });
+        }
+        let mut state = lock(&self.state);
+        loop {
+            state.clock += 1;
+            let clock = state.clock;
+            if let Some(held) = state.held.iter_mut().find(|h| h.set == set) {
+                if let Some(resident) = held.resident.clone() {
+                    held.users += 1;
+                    held.used_at = clock;
+                    return Ok(Lease { memory: self, resident, set: set.to_vec(), warm: true });
+                }
+            } else if self.make_room(&mut state, bytes) {
+                break;
+            }
+            state = self.changed.wait(state).unwrap_or_else(PoisonError::into_inner);
+        }
+        let used_at = state.clock;
+        state.held.push(Held { set: set.to_vec(), bytes, users: 1, used_at, resident: None });
+        let used = state.held.iter().map(|h| h.bytes).sum();
+        state.peak = state.peak.max(used);
+        drop(state);
+
+        // a load that fails (or panics) must not leave others waiting for it
+        struct Undo<'a>(Option<(&'a Memory, &'a [u32])>);
+        impl Drop for Undo<'_> {
+            fn drop(&mut self) {
+                if let Some((memory, set)) = self.0 {
+                    lock(&memory.state).held.retain(|h| h.set != set);
+                    memory.changed.notify_all();
+                }
+            }
+        }
+        let mut undo = Undo(Some((self, set)));
+        let resident = Arc::new(load()?);
+        undo.0 = None;
+        let mut state = lock(&self.state);
+        if let Some(held) = state.held.iter_mut().find(|h| h.set == set) {
+            held.resident = Some(resident.clone());
+        }
+        self.changed.notify_all();
+        Ok(Lease { memory: self, resident, set: set.to_vec(), warm: false })
+    }
+
+    /// Drops what was unused longest until there is room; false when tasks use too much.
+    fn make_room(&self, state: &mut State, bytes: u64) -> bool {
+        loop {
+            let used: u64 = state.held.iter().map(|h| h.bytes).sum();
+            if used + bytes <= self.capacity {
+                return true;
+            }
+            let idle =
+                (0..state.held.len()).filter(|&i| state.held[i].users == 0).min_by_key(|&i| state.held[i].used_at);
+            let Some(oldest) = idle else { return false };
+            state.held.swap_remove(oldest);
+        }
+    }
+}
+
+/// A lock; what a thread that panicked left behind is still consistent here, because nothing is changed half.
+fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}

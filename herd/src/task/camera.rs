@@ -1,0 +1,118 @@
+//! Camera rays of the units that a task was given.
+
+use rayherd_render::film::TILE;
+use rayherd_render::frame::Frame;
+use rayherd_render::path::{PathRay, camera_ray};
+
+use crate::wave::CameraUnit;
+
+/// Makes camera rays one after the other: tile by tile, pixel by pixel, the samples of a pixel together.
+pub struct CameraFeed<'a> {
+    frame: &'a Frame,
+    units: std::vec::IntoIter<CameraUnit>,
+    current: Option<(CameraUnit, Cursor)>,
+    /// Rays made so far.
+    pub made: u64,
+}
+
+#[derive(Clone, Copy)]
+struct Cursor {
+    x: u32,
+    y: u32,
+    sample: u32,
+}
+
+impl<'a> CameraFeed<'a> {
+    /// Rays of the units, in their order.
+    pub fn new(frame: &'a Frame, units: Vec<CameraUnit>) -> Self {
+        CameraFeed { frame, units: units.into_iter(), current: None, made: 0 }
+    }
+
+    /// Appends rays until `out` has `len` of them or there are none left.
+    pub fn fill(&mut self, out: &mut Vec<PathRay>, len: usize) {
+        while out.len() < len {
+            let Some((unit, mut at)) = self.current.take().or_else(|| self.next_unit()) else { return };
+            let [(x0, x1), (_, y1)] = tile(self.frame, unit.tile);
+            while out.len() < len {
+                out.push(camera_ray(self.frame, at.y * self.frame.size[0] + at.x, at.sample));
+                self.made += 1;
+                at.sample += 1;
+                if at.sample == unit.end {
+                    (at.sample, at.x) = (unit.first, at.x + 1);
+                    if at.x == x1 {
+                        (at.x, at.y) = (x0, at.y + 1);
+                    }
+                }
+                if at.y == y1 {
+                    break;
+                }
+            }
+            if at.y < y1 {
+                self.current = Some((unit, at));
+            }
+        }
+    }
+
+    fn next_unit(&mut self) -> Option<(CameraUnit, Cursor)> {
+        let unit = self.units.find(|u| u.first < u.end)?;
+        let [(x, _), (y, _)] = tile(self.frame, unit.tile);
+        Some((unit, Cursor { x, y, sample: unit.first }))
+    }
+}
+
+/// Ranges of x and y of a film tile.
+fn tile(frame: &Frame, tile: u32) -> [(u32, u32); 2] {
+    let across = frame.size[0].div_ceil(TILE);
+    let range = |i: u32, end: u32| (i * TILE, ((i + 1) * TILE).min(end));
+    [range(tile % across, frame.size[0]), range(tile / across, frame.size[1])]
+}
+
+/// Number of film tiles of a frame.
+pub fn tiles(frame: &Frame) -> u32 {
+    frame.size[0].div_ceil(TILE) * frame.size[1].div_ceil(TILE)
+}
+
+/// Pixels of a film tile.
+pub fn tile_pixels(frame: &Frame, number: u32) -> u32 {
+    let [(x0, x1), (y0, y1)] = tile(frame, number);
+    (x1 - x0) * (y1 - y0)
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::BTreeSet;
+
+    use rayherd_render::camera::Camera;
+    use rayherd_render::filter::Filter;
+
+    use super::*;
+
+    #[test]
+    fn every_sample_of_every_pixel_is_made_once_whatever_the_batch() {
+        let size = [70, 33];
+        let camera =
+            Camera::new(&[[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]], 40.0, size, [0.0; 3]);
+        let frame =
+            Frame { camera: camera.unwrap(), size, filter: Filter::Box, seed: 1, max_depth: 3, rr_depth: 5, split: 1 };
+        let units: Vec<CameraUnit> = (0..tiles(&frame)).map(|tile| CameraUnit { tile, first: 2, end: 5 }).collect();
+        assert_eq!(units.len(), 6);
+        let pixels: u32 = (0..6).map(|t| tile_pixels(&frame, t)).sum();
+        assert_eq!(pixels, 70 * 33);
+        for len in [1, 7, 4096, 100_000] {
+            let mut feed = CameraFeed::new(&frame, units.clone());
+            let mut keys = BTreeSet::new();
+            let mut out = Vec::new();
+            loop {
+                out.clear();
+                feed.fill(&mut out, len);
+                if out.is_empty() {
+                    break;
+                }
+                assert!(out.len() <= len);
+                out.iter().for_each(|r| assert!(keys.insert((r.key.pixel, r.key.sample))));
+            }
+            assert_eq!((keys.len(), feed.made), (70 * 33 * 3, 70 * 33 * 3));
+            assert!(keys.iter().all(|k| (2..5).contains(&k.1)));
+        }
+    }
+}

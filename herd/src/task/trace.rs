@@ -1,0 +1,279 @@
+//! The trace loop: rays in, contributions to the film, rays that leave.
+//!
+//! Depth first in time: the newest rays are traced first, and camera rays are made only to fill up a batch, so what
+//! is in memory is bounded by the batch and the siblings of a first hit, not by the task.
+
+use rayherd_render::bvh::{Kernel, Tracer, UnsupportedKernel};
+use rayherd_render::film::FilmPart;
+use rayherd_render::path::{Context, Outcome, PathRay, Surfaces, shade};
+use rayherd_render::ray::{Hit, MISS, Ray};
+use rayherd_scene::grid::Grid;
+
+use super::CameraFeed;
+use crate::flight::{Candidate, Flights, PathFlight, ShadowFlight, Visit};
+use crate::job::JobError;
+use crate::report::RayCounts;
+use crate::resident::Resident;
+
+/// Where rays go that leave the resident splits.
+pub trait Outbox {
+    /// A path's ray for a split.
+    fn path(&mut self, to: u32, flight: PathFlight) -> Result<(), JobError>;
+    /// A shadow ray for a split.
+    fn shadow(&mut self, to: u32, flight: ShadowFlight) -> Result<(), JobError>;
+}
+
+/// Asked between batches: an error ends the task (it was killed, the job is over).
+pub trait Stop {
+    /// Whether to go on.
+    fn check(&self) -> Result<(), JobError>;
+}
+
+/// Buffers and counts of one thread's loop.
+pub struct Loop {
+    tracer: Tracer,
+    batch: usize,
+    /// Rays that were made and traced here; a ray is counted by the task that makes it.
+    pub rays: RayCounts,
+    rays_in: Vec<Ray>,
+    hits: Vec<Hit>,
+    occluded: Vec<bool>,
+    outcome: Outcome,
+}
+
+impl Loop {
+    /// A loop that traces `batch` rays (at least 1) together.
+    pub fn new(kernel: Kernel, batch: usize) -> Result<Self, UnsupportedKernel> {
+        Ok(Loop {
+            tracer: Tracer::new(kernel)?,
+            batch: batch.max(1),
+            rays: RayCounts::default(),
+            rays_in: Vec::new(),
+            hits: Vec::new(),
+            occluded: Vec::new(),
+            outcome: Outcome::default(),
+        })
+    }
+
+    /// Traces everything to its end, where no ray can leave: the plain loop, which nothing beside it slows down.
+    ///
+    /// The flights must have no candidate elsewhere, as all splits are here.
+    pub fn run_complete<S: Surfaces>(
+        &mut self,
+        context: &Context,
+        resident: &Resident,
+        surfaces: &S,
+        flights: &mut Flights,
+        camera: &mut CameraFeed,
+        film: &mut FilmPart,
+        stop: &dyn Stop,
+    ) -> Result<(), JobError> {
+        let forest = resident.forest();
+        let mut pending: Vec<PathRay> = flights.paths.drain(..).map(|f| f.ray).collect();
+        self.outcome.shadow.extend(flights.shadows.drain(..).map(|f| f.ray));
+        let mut current: Vec<PathRay> = Vec::new();
+        loop {
+            stop.check()?;
+            self.occlude(resident, film);
+            let from = pending.len().saturating_sub(self.batch);
+            current.clear();
+            current.extend(pending.drain(from..));
+            let made = camera.made;
+            camera.fill(&mut current, self.batch);
+            self.count_camera(camera.made - made, context);
+            if current.is_empty() {
+                return Ok(());
+            }
+            self.rays_in.clear();
+            self.rays_in.extend(current.iter().map(PathRay::ray));
+            self.hits.resize(self.rays_in.len(), Hit::miss(0.0));
+            self.tracer.closest(forest, &self.rays_in, &mut self.hits);
+            shade(context, surfaces, &current, &self.hits, &mut self.outcome);
+            self.collect(film);
+            pending.append(&mut self.outcome.next);
+        }
+    }
+
+    /// Adds what was shaded to the film, and counts the rays that it made.
+    fn collect(&mut self, film: &mut FilmPart) {
+        for light in self.outcome.light.drain(..) {
+            film.add(light.pixel, light.sample, light.value);
+        }
+        self.rays.closest += self.outcome.next.len() as u64;
+        self.rays.shadow += self.outcome.shadow.len() as u64;
+    }
+
+    /// Traces the shadow rays of the last batch where nothing else can be in the way.
+    fn occlude(&mut self, resident: &Resident, film: &mut FilmPart) {
+        let shadows = &self.outcome.shadow;
+        self.rays_in.clear();
+        self.rays_in.extend(shadows.iter().map(|s| s.ray()));
+        self.occluded.resize(shadows.len(), false);
+        self.tracer.any(resident.forest(), &self.rays_in, &mut self.occluded);
+        for (shadow, occluded) in shadows.iter().zip(&self.occluded) {
+            if !occluded {
+                let light = shadow.light();
+                film.add(light.pixel, light.sample, light.value);
+            }
+        }
+        self.outcome.shadow.clear();
+    }
+
+    /// Traces rays until all have ended or left the resident splits.
+    pub fn run<S: Surfaces>(
+        &mut self,
+        context: &Context,
+        grid: &Grid,
+        resident: &Resident,
+        surfaces: &S,
+        flights: &mut Flights,
+        camera: &mut CameraFeed,
+        film: &mut FilmPart,
+        outbox: &mut dyn Outbox,
+        stop: &dyn Stop,
+    ) -> Result<(), JobError> {
+        let mut current: Vec<PathFlight> = Vec::new();
+        let mut made: Vec<PathRay> = Vec::new();
+        let (mut ready, mut ready_hits): (Vec<PathRay>, Vec<Hit>) = Default::default();
+        loop {
+            stop.check()?;
+            while flights.shadows.len() >= self.batch || (flights.paths.is_empty() && !flights.shadows.is_empty()) {
+                let from = flights.shadows.len().saturating_sub(self.batch);
+                let batch: Vec<ShadowFlight> = flights.shadows.drain(from..).collect();
+                self.shadows(grid, resident, &batch, film, outbox)?;
+            }
+            let from = flights.paths.len().saturating_sub(self.batch);
+            current.clear();
+            current.extend(flights.paths.drain(from..));
+            if current.is_empty() {
+                made.clear();
+                camera.fill(&mut made, self.batch);
+                self.count_camera(made.len() as u64, context);
+                current.extend(made.iter().map(|&r| PathFlight::new(r)));
+            }
+            if current.is_empty() && flights.shadows.is_empty() {
+                return Ok(());
+            }
+            self.closest(resident, &mut current);
+            ready.clear();
+            ready_hits.clear();
+            for (flight, hit) in current.iter().zip(&self.hits) {
+                let mut ray = flight.ray.ray();
+                ray.tmax = flight.candidate.t;
+                if let Some((to, visit)) = flight.visit.next(grid, &ray, resident.splits()) {
+                    outbox.path(to, PathFlight { visit, ..*flight })?;
+                } else if flight.candidate.is_hit() && !hit.is_hit() {
+                    if flight.visit == Visit::DECIDED {
+                        return Err(absent(flight));
+                    }
+                    outbox.path(flight.candidate.split, PathFlight { visit: Visit::DECIDED, ..*flight })?;
+                } else {
+                    ready.push(flight.ray);
+                    ready_hits.push(*hit);
+                }
+            }
+            shade(context, surfaces, &ready, &ready_hits, &mut self.outcome);
+            self.collect(film);
+            self.take_spawned(flights);
+        }
+    }
+
+    /// Traces a batch and updates its candidates. Afterwards a hit is one of `self.hits` when the candidate is here, and a
+    /// miss when there is none or it is elsewhere.
+    pub fn closest(&mut self, resident: &Resident, batch: &mut [PathFlight]) {
+        self.rays_in.clear();
+        self.rays_in.extend(batch.iter().map(|f| Ray { tmax: f.candidate.t, ..f.ray.ray() }));
+        self.hits.resize(batch.len(), Hit::miss(0.0));
+        self.tracer.closest(resident.forest(), &self.rays_in, &mut self.hits);
+        for (flight, hit) in batch.iter_mut().zip(&mut self.hits) {
+            if !hit.is_hit() {
+                continue;
+            }
+            let prim = resident.forest().prim_id(hit.prim);
+            let found = Candidate { t: hit.t, prim, split: resident.split_of(hit.prim) };
+            if found.before(&flight.candidate) || (found.t == flight.candidate.t && found.prim == flight.candidate.prim)
+            {
+                flight.candidate = found;
+            } else {
+                // the candidate is at the same distance and goes first: its primitive is not here
+                hit.prim = MISS;
+            }
+        }
+    }
+
+    /// Traces shadow rays: those that pass go on, or bring their light.
+    pub fn shadows(
+        &mut self,
+        grid: &Grid,
+        resident: &Resident,
+        batch: &[ShadowFlight],
+        film: &mut FilmPart,
+        outbox: &mut dyn Outbox,
+    ) -> Result<(), JobError> {
+        self.occluded.resize(batch.len(), false);
+        self.rays_in.clear();
+        self.rays_in.extend(batch.iter().map(|f| f.ray.ray()));
+        self.tracer.any(resident.forest(), &self.rays_in, &mut self.occluded);
+        for (i, flight) in batch.iter().enumerate() {
+            if self.occluded[i] {
+                continue;
+            }
+            if let Some((to, visit)) = flight.visit.next(grid, &self.rays_in[i], resident.splits()) {
+                outbox.shadow(to, ShadowFlight { visit, ..*flight })?;
+            } else {
+                let light = flight.ray.light();
+                film.add(light.pixel, light.sample, light.value);
+            }
+        }
+        Ok(())
+    }
+
+    /// Keeps the shadow rays that nothing here is in the way of.
+    pub fn unoccluded(&mut self, resident: &Resident, batch: &[ShadowFlight], out: &mut Vec<ShadowFlight>) {
+        self.occluded.resize(batch.len(), false);
+        self.rays_in.clear();
+        self.rays_in.extend(batch.iter().map(|f| f.ray.ray()));
+        self.tracer.any(resident.forest(), &self.rays_in, &mut self.occluded);
+        out.extend(batch.iter().zip(&self.occluded).filter(|(_, o)| !**o).map(|(f, _)| *f));
+    }
+
+    /// Shades rays whose hit was decided and is here; the rays that they spawn go to `out`.
+    pub fn shade_decided<S: Surfaces>(
+        &mut self,
+        context: &Context,
+        resident: &Resident,
+        surfaces: &S,
+        batch: &mut [PathFlight],
+        out: &mut Flights,
+        film: &mut FilmPart,
+    ) -> Result<(), JobError> {
+        self.closest(resident, batch);
+        let rays: Vec<PathRay> = batch.iter().map(|f| f.ray).collect();
+        if let Some(i) = self.hits.iter().position(|h| !h.is_hit()) {
+            return Err(absent(&batch[i]));
+        }
+        shade(context, surfaces, &rays, &self.hits, &mut self.outcome);
+        self.collect(film);
+        self.take_spawned(out);
+        Ok(())
+    }
+
+    fn take_spawned(&mut self, out: &mut Flights) {
+        out.paths.extend(self.outcome.next.drain(..).map(PathFlight::new));
+        let shadows = self.outcome.shadow.drain(..);
+        out.shadows.extend(shadows.map(|ray| ShadowFlight { ray, visit: Visit::START }));
+    }
+
+    /// Counts camera rays.
+    pub fn count_camera(&mut self, made: u64, context: &Context) {
+        self.rays.camera += made;
+        self.rays.closest += made;
+        // siblings share the camera ray that they would each have traced
+        self.rays.merged += made * u64::from(context.frame.split - 1);
+    }
+}
+
+/// A ray came for a primitive that is not there.
+fn absent(flight: &PathFlight) -> JobError {
+    JobError::Internal(format!("split {} lacks primitive {}", flight.candidate.split, flight.candidate.prim))
+}

@@ -1,0 +1,113 @@
+//! Small scenes for tests.
+
+use std::sync::Arc;
+
+use rayherd_render::camera::Camera;
+use rayherd_render::filter::Filter;
+use rayherd_render::frame::Frame;
+use rayherd_scene::description::{Affine, Bsdf, Description, Distribution, Geometry, Material, Place, Shape};
+use rayherd_scene::import::{DescriptionSource, StreamOptions};
+use rayherd_scene::objects::MemoryObjects;
+use rayherd_scene::prepare::{Cut, NoProgress, PrepareSettings, SpoolSettings, prepare};
+
+use crate::job::PreparedScene;
+
+/// A rectangle of `n` x `n` quads, from a corner along two edges; its front is on the side of `u x v`.
+fn sheet(corner: [f64; 3], u: [f64; 3], v: [f64; 3], n: u32) -> Geometry {
+    let at = |i: u32, j: u32| {
+        let (s, t) = (f64::from(i) / f64::from(n), f64::from(j) / f64::from(n));
+        std::array::from_fn(|a| corner[a] + s * u[a] + t * v[a])
+    };
+    let mut positions = Vec::new();
+    for j in 0..=n {
+        positions.extend((0..=n).map(|i| at(i, j)));
+    }
+    let mut triangles = Vec::new();
+    for j in 0..n {
+        for i in 0..n {
+            let p = |i: u32, j: u32| j * (n + 1) + i;
+            triangles.push([p(i, j), p(i + 1, j), p(i + 1, j + 1)]);
+            triangles.push([p(i, j), p(i + 1, j + 1), p(i, j + 1)]);
+        }
+    }
+    Geometry::Inline { positions, triangles, uv: vec![] }
+}
+
+fn shape(name: &str, geometry: Geometry, material: u32, emission: Option<[f32; 3]>) -> Shape {
+    Shape {
+        name: name.to_owned(),
+        place: Place::default(),
+        geometry,
+        to_world: Affine::IDENTITY,
+        material,
+        emission,
+        flip_normals: false,
+        face_normals: false,
+    }
+}
+
+fn material(name: &str, bsdf: Bsdf) -> Material {
+    Material { name: name.to_owned(), bsdf, two_sided: true }
+}
+
+/// A box with coloured walls, open to the camera, a light below its ceiling, a block, a matt and a metal ball.
+pub fn cornell() -> Description {
+    let wall = |r, g, b| Bsdf::Diffuse { reflectance: [r, g, b] };
+    let metal = Bsdf::RoughConductor {
+        distribution: Distribution::Ggx,
+        alpha: [0.3, 0.3],
+        eta: [0.2, 0.9, 1.1],
+        k: [3.9, 2.5, 2.1],
+        specular: [1.0; 3],
+    };
+    let materials = vec![
+        material("white", wall(0.7, 0.7, 0.7)),
+        material("red", wall(0.6, 0.1, 0.1)),
+        material("green", wall(0.1, 0.5, 0.1)),
+        material("metal", metal),
+    ];
+    let n = 5;
+    let shapes = vec![
+        shape("floor", sheet([-1.0, -1.0, -1.0], [0.0, 0.0, 2.0], [2.0, 0.0, 0.0], n), 0, None),
+        shape("ball", Geometry::Sphere { center: [0.45, -0.7, -0.2], radius: 0.3 }, 0, None),
+        shape("ceiling", sheet([-1.0, 1.0, -1.0], [2.0, 0.0, 0.0], [0.0, 0.0, 2.0], n), 0, None),
+        shape("left", sheet([-1.0, -1.0, -1.0], [0.0, 2.0, 0.0], [0.0, 0.0, 2.0], n), 1, None),
+        shape("light", sheet([-0.3, 0.95, -0.3], [0.6, 0.0, 0.0], [0.0, 0.0, 0.6], 2), 0, Some([9.0, 8.0, 6.0])),
+        shape("back", sheet([-1.0, -1.0, -1.0], [2.0, 0.0, 0.0], [0.0, 2.0, 0.0], n), 0, None),
+        shape("right", sheet([1.0, -1.0, -1.0], [0.0, 0.0, 2.0], [0.0, 2.0, 0.0], n), 2, None),
+        shape("metal ball", Geometry::Sphere { center: [-0.4, -0.6, 0.2], radius: 0.4 }, 3, None),
+        shape("block", sheet([-0.5, -1.0, -0.6], [0.6, 0.0, 0.2], [0.0, 1.1, 0.1], 4), 0, None),
+    ];
+    Description {
+        shapes,
+        materials,
+        environment: Some([0.05, 0.06, 0.08]),
+        camera: None,
+        size: None,
+        filter: None,
+        spp: None,
+        max_depth: None,
+        rr_depth: None,
+        substitutions: vec![],
+        bounds: None,
+        bytes_read: 0,
+    }
+}
+
+/// Prepares a description, cut into splits, into memory.
+pub fn prepared(description: &Description, splits: u32, overlap_reduction: bool) -> PreparedScene {
+    let objects = Arc::new(MemoryObjects::default());
+    let source = DescriptionSource::new(description, StreamOptions::default());
+    let settings = PrepareSettings { cut: Cut::Splits(splits), overlap_reduction, ..PrepareSettings::default() };
+    let made =
+        prepare(description, &source, &settings, &SpoolSettings::default(), objects.as_ref(), &NoProgress).unwrap();
+    PreparedScene::open(made.manifest, objects).unwrap()
+}
+
+/// A view into the box.
+pub fn frame(scene: &PreparedScene, size: [u32; 2], split: u32) -> Frame {
+    // looks along -z of the world from in front of the box: camera z = -z, x to the left
+    let to_world = [[-1.0, 0.0, 0.0, 0.05], [0.0, 1.0, 0.0, -0.1], [0.0, 0.0, -1.0, 3.3]];
+    let camera = Camera::new(&to_world, 45.0, size, scene.manifest.offset).unwrap();
+    Frame { camera, size, filter: Filter::Tent { radius: 1.0 }, seed: 7, max_depth: 6, rr_depth: 3, split }
+}
