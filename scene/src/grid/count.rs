@@ -231,3 +231,67 @@ pub fn choose(candidates: &[Candidate], splits: u32, capacity: u64, settings: &P
     let least = candidates.iter().map(|c| c.fullest).min().unwrap_or(0);
     (candidates.iter().position(|c| c.fullest == least).unwrap_or(finest), StoppedBy::Limit)
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::prepare::Cut;
+
+    fn settings() -> PrepareSettings {
+        PrepareSettings { cut: Cut::Splits(32), ..Default::default() }
+    }
+
+    fn candidate(subdiv: u32, fullest: u64, occupied: u64, contested: f64) -> Candidate {
+        Candidate { subdiv, occupied, fullest, pairs: 1000, contested_pairs: (1000.0 * contested) as u64 }
+    }
+
+    #[test]
+    fn it_starts_at_the_papers_subdivision_and_reaches_a_sheet() {
+        let first = |splits| candidates(splits, &settings())[0];
+        assert_eq!([1, 8, 9, 10, 27, 28, 32].map(first), [1, 2, 3, 3, 3, 4, 4]);
+        let of_ct = candidates(32, &settings());
+        assert!(of_ct.contains(&10) && *of_ct.last().unwrap() >= 23, "{of_ct:?}");
+        let many = candidates(100_000, &settings());
+        assert!(many.iter().all(|&n| n <= settings().max_subdiv));
+        assert!(many.iter().map(|&n| (n as usize).pow(3)).sum::<usize>() <= MOST_CELLS);
+        let small = PrepareSettings { max_subdiv: 3, ..settings() };
+        assert_eq!(candidates(1000, &small), [3]);
+    }
+
+    #[test]
+    fn the_three_conditions() {
+        let choose = |c: &[Candidate]| choose(c, 32, 100, &settings());
+        // condition 2 alone: finer until the share is at the threshold
+        let c = [candidate(4, 90, 40, 0.5), candidate(5, 80, 60, 0.2), candidate(6, 70, 80, 0.1)];
+        assert_eq!(choose(&c), (1, StoppedBy::Threshold));
+        // condition 3 wins over condition 2
+        let c = [candidate(4, 90, 40, 0.5), candidate(5, 80, 512, 0.4), candidate(6, 70, 600, 0.1)];
+        assert_eq!(choose(&c), (1, StoppedBy::Several));
+        // condition 1 wins over both
+        let c = [candidate(4, 101, 600, 0.1), candidate(5, 101, 700, 0.1), candidate(6, 100, 800, 0.9)];
+        assert_eq!(choose(&c), (2, StoppedBy::Several));
+        // nothing is good enough: the finest that a split can hold
+        let c = [candidate(4, 90, 40, 0.5), candidate(5, 80, 60, 0.4)];
+        assert_eq!(choose(&c), (1, StoppedBy::Limit));
+        // a cell stays too full: no finer than helps
+        let c = [candidate(4, 400, 40, 0.5), candidate(5, 300, 60, 0.4), candidate(6, 300, 90, 0.4)];
+        assert_eq!(choose(&c), (1, StoppedBy::Limit));
+        assert_eq!(choose(&[candidate(1, 1, 1, 0.0)]), (0, StoppedBy::Threshold));
+    }
+
+    #[test]
+    fn a_triangle_counts_in_every_cell_it_overlaps() {
+        let lattice = Lattice::new(2, [0.0; 3], [2.0; 3]).unwrap();
+        let mut counter = Counter::new(lattice);
+        let small = |x: f32| [[x, 0.1, 0.1], [x + 0.2, 0.1, 0.1], [x, 0.3, 0.1]];
+        let first = [small(0.1), small(0.2), small(0.9)];
+        counter.add(0, Primitives { triangles: &first, spheres: &[] });
+        counter.add(1, Primitives { triangles: &[small(0.3)], spheres: &[([0.5, 0.5, 0.5], 0.25)] });
+        counter.add(1, Primitives { triangles: &[small(1.3)], spheres: &[] });
+        let mut occupied: Vec<_> = counter.occupied().collect();
+        occupied.sort();
+        assert_eq!(occupied, [(0, 5, 2), (1, 2, 2)]);
+        let sum = counter.summary();
+        assert_eq!((sum.occupied, sum.fullest, sum.pairs, sum.contested_pairs), (2, 5, 7, 7));
+    }
+}

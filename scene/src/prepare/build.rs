@@ -29,6 +29,13 @@ pub(crate) struct Built {
     pub tree: Duration,
 }
 
+/// Geometry object of a split.
+pub(crate) fn block(number: u32, records: &Records) -> Result<Vec<u8>, PrepareError> {
+    let spheres: Vec<_> = records.spheres.iter().map(|s| s.sphere()).collect();
+    build_block(&records.triangles, &records.triangle_ids, &spheres, &records.sphere_ids, &Rayon)
+        .map_err(|source| PrepareError::Build { split: number, source })
+}
+
 /// Builds and stores a split of at least one primitive. `number` is for messages.
 pub(crate) fn build_split(
     number: u32,
@@ -36,10 +43,8 @@ pub(crate) fn build_split(
     copied: bool,
     store: &CountingStore,
 ) -> Result<Built, PrepareError> {
-    let spheres: Vec<_> = records.spheres.iter().map(|s| s.sphere()).collect();
     let started = Instant::now();
-    let block = build_block(&records.triangles, &records.triangle_ids, &spheres, &records.sphere_ids, &Rayon)
-        .map_err(|source| PrepareError::Build { split: number, source })?;
+    let block = block(number, records)?;
     let tree = started.elapsed();
     let geometry = store.put(ObjectKind::Geometry, &block)?;
     drop(block);

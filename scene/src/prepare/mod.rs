@@ -43,7 +43,7 @@ use crate::manifest::{Counts, Defaults, FORMAT, GridChoice, Manifest, ManifestEr
 use crate::objects::{ObjectError, ObjectHash, ObjectKind, ObjectRef, ObjectStore};
 use crate::overlap;
 use crate::record::RecordSource;
-use crate::split::{Capacity, cut};
+use crate::split::{Capacity, bytes_each, cut, windows};
 
 use build::build_split;
 use counting::CountingStore;
@@ -160,11 +160,11 @@ pub fn prepare(
 
     // 3
     let primitives = counts.triangles + counts.spheres;
-    let ranges = cut(settings.cut, primitives);
+    let capacity = Capacity::new(settings.cut, primitives, bytes_each(&sample(&spool, settings.cut, primitives)?));
+    let ranges = cut(settings.cut, primitives, capacity);
     if ranges.len() >= 1 << 22 {
         return Err(PrepareError::TooManySplits(ranges.len() as u64));
     }
-    let capacity = Capacity::new(settings.cut, primitives);
     let (cells, mut choice) =
         choose_grid(&spool, &ranges, (lo, hi), capacity, settings, progress).map_err(spool_error)?;
 
@@ -275,6 +275,16 @@ fn content_hash(offset: &[f64; 3], records: &blake3::Hash, world: &[u8]) -> Obje
     }
     hasher.update(records.as_bytes()).update(world);
     ObjectHash(*hasher.finalize().as_bytes())
+}
+
+/// Builds a few small blocks to see what a primitive takes: (bytes, primitives) of each.
+fn sample(spool: &Spool, cut: Cut, primitives: u64) -> Result<Vec<(u64, u64)>, PrepareError> {
+    let build = |range: &Range<u64>| {
+        let records =
+            spool.range(range).map_err(|source| PrepareError::Spool { folder: spool.folder().clone(), source })?;
+        Ok((build::block(0, &records)?.len() as u64, records.len() as u64))
+    };
+    windows(cut, primitives).iter().map(build).collect()
 }
 
 /// Counts all candidates in one pass over the spool and picks one.

@@ -1,12 +1,15 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::atomic::{AtomicU32, Ordering};
 
-use rayherd_render::bvh::Forest;
+use rayherd_render::attributes::AttributeBlock;
+use rayherd_render::bvh::{Forest, Kernel, Tracer};
+use rayherd_render::ray::{Hit, Ray};
 
 use super::*;
 use crate::description::{Affine, Bsdf, Geometry, Material, Place, Shape};
 use crate::grid::touch::{sphere_cells, triangle_cells};
-use crate::objects::MemoryObjects;
+use crate::grid::{Progress, SplitSet};
+use crate::objects::{DirectoryObjects, MemoryObjects};
 use crate::record::{Record, RecordStream, SphereRecord, TriangleRecord};
 
 /// Records in memory, and how often they were read.
@@ -226,5 +229,232 @@ fn every_primitive_is_where_the_grid_says() {
         } else {
             assert_eq!((choice.copies, manifest.grid.subdiv), (0, 1));
         }
+    }
+}
+
+#[test]
+fn the_bytes_do_not_depend_on_threads_or_the_spool() {
+    let records = scene(5, 3000);
+    let mut first: Option<(ObjectRef, BTreeMap<ObjectHash, Vec<u8>>)> = None;
+    for (threads, memory) in [(1, u64::MAX), (2, 0), (3, 50_000)] {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+        let store = MemoryObjects::new();
+        let spool = SpoolSettings { memory, folder: None };
+        let source = List::new(records.clone());
+        let prepared = pool
+            .install(|| prepare(&description("list"), &source, &settings(11, true), &spool, &store, &NoProgress))
+            .unwrap();
+        let spooled = prepared.report.bytes.iter().filter(|r| r.kind == ByteKind::Spool).map(|r| r.bytes).sum::<u64>();
+        assert_eq!(spooled > 0, memory < u64::MAX);
+        let made = (prepared.reference, store.snapshot());
+        assert_eq!(first.get_or_insert_with(|| made.clone()), &made, "{threads} threads");
+    }
+}
+
+#[test]
+fn by_block_size_blocks_are_as_large_as_asked_for() {
+    let records = scene(6, 20_000);
+    let store = MemoryObjects::new();
+    for size in [20_000u64, 100_000] {
+        let cut = PrepareSettings { cut: Cut::BlockSize(size), ..Default::default() };
+        let manifest = run(&records, &cut, &store).unwrap().manifest;
+        let fullest = manifest.grid.cells.iter().map(|c| c.primitives).max().unwrap();
+        let of_source: Vec<u64> = manifest.splits.iter().filter(|s| !s.copied).map(|s| s.geometry.bytes).collect();
+        let (last, full) = of_source.split_last().unwrap();
+        assert!(*last * 10 <= size * 12);
+        assert!(full.iter().all(|&b| b * 10 >= size * 8 && b * 10 <= size * 12), "{size}: {of_source:?}");
+        if fullest <= manifest.choice.capacity {
+            assert!(manifest.splits.iter().all(|s| s.geometry.bytes * 10 <= size * 12));
+        }
+    }
+}
+
+#[test]
+fn preparing_again_does_nothing_and_says_so() {
+    let folder = tempfile::tempdir().unwrap();
+    let store = DirectoryObjects::open(folder.path()).unwrap();
+    let source = List::new(scene(7, 1000));
+    let go = |settings: &PrepareSettings| {
+        prepare(&description("list"), &source, settings, &SpoolSettings::default(), &store, &NoProgress).unwrap()
+    };
+    let first = go(&settings(4, true));
+    assert!(!first.reused);
+    assert_eq!(source.reads.load(Ordering::Relaxed), 2);
+    let again = go(&settings(4, true));
+    assert!(again.reused);
+    assert_eq!((again.reference, &again.manifest), (first.reference, &first.manifest));
+    assert_eq!(source.reads.load(Ordering::Relaxed), 2);
+    // without overlap reduction: another scene, made of the same objects but for the copies
+    let plain = go(&settings(4, false));
+    assert!(!plain.reused);
+    assert_eq!(plain.manifest.content, first.manifest.content);
+    assert_eq!(plain.manifest.splits[..], first.manifest.splits[..4]);
+    assert_eq!(plain.manifest.world, first.manifest.world);
+
+    // a cut object is noticed and made again, a changed one is named when it is read
+    let broken = first.manifest.splits[1].geometry;
+    let path = store.path_of(&broken.hash);
+    let body = std::fs::read(&path).unwrap();
+    std::fs::write(&path, &body[..body.len() / 2]).unwrap();
+    assert!(!go(&settings(4, true)).reused);
+    assert_eq!(store.get(&broken).unwrap(), body);
+    let mut changed = body.clone();
+    changed[body.len() / 2] ^= 8;
+    std::fs::write(&path, &changed).unwrap();
+    let error = store.get(&broken).unwrap_err().to_string();
+    assert!(error.contains(&broken.hash.to_string()) && error.contains("prepare the scene again"), "{error}");
+}
+
+#[test]
+fn content_names_the_scene_however_it_was_cut() {
+    let store = MemoryObjects::new();
+    let records = scene(8, 500);
+    let content = |records: &[Record], splits| run(records, &settings(splits, true), &store).unwrap().manifest.content;
+    let one = content(&records, 1);
+    // another store, as the list's fingerprint does not see its records
+    let other = MemoryObjects::new();
+    let of_other =
+        |records: &[Record], splits| run(records, &settings(splits, false), &other).unwrap().manifest.content;
+    assert_eq!(of_other(&records, 9), one);
+    let mut moved = records.clone();
+    let Record::Triangle(t) = &mut moved[100] else { panic!() };
+    t.p[0][0] += 1e-3;
+    assert_ne!(of_other(&moved, 10), one);
+    let mut swapped = records;
+    swapped.swap(100, 101);
+    assert_ne!(of_other(&swapped, 11), one);
+}
+
+#[test]
+fn attributes_and_lights_stay_with_their_primitives() {
+    let records = scene(9, 1200);
+    let store = MemoryObjects::new();
+    let manifest = run(&records, &settings(6, true), &store).unwrap().manifest;
+    for split in &manifest.splits {
+        let bytes = store.get(&split.geometry).unwrap();
+        let mut forest = Forest::new(64 << 20).unwrap();
+        let block = forest.insert(&bytes).unwrap();
+        let count = (split.triangles + split.spheres) as u32;
+        let attributes = AttributeBlock::decode(&store.get(&split.attributes).unwrap(), count).unwrap();
+        for slot in forest.slots(block).unwrap() {
+            let (_, local) = forest.slot(slot);
+            let i = local as usize;
+            let (shape, n, uv) = match &records[forest.prim_id(slot) as usize] {
+                Record::Triangle(t) => (t.shape, t.n, t.uv),
+                Record::Sphere(s) => (s.shape, None, None),
+            };
+            assert_eq!(attributes.shapes[i], shape);
+            assert_eq!(attributes.normals.get(i).copied().unwrap_or_default(), n.unwrap_or_default());
+            assert_eq!(attributes.uvs.get(i).copied().unwrap_or_default(), uv.unwrap_or_default());
+        }
+    }
+    let world: World = serde_json::from_slice(&store.get(&manifest.world).unwrap()).unwrap();
+    let lights: Vec<u64> = world.emissive.iter().map(|e| e.prim).collect();
+    let expected: Vec<u64> = (0..1200).filter(|i| i % 50 == 7 && !(5..=8).contains(&(i % 40))).collect();
+    assert_eq!(lights, expected);
+}
+
+#[test]
+fn what_cannot_be_prepared_is_said() {
+    let store = MemoryObjects::new();
+    let nothing = run(&[], &settings(2, true), &store).unwrap_err();
+    assert!(matches!(nothing, PrepareError::Empty { records: 0, .. }));
+    let flat = Record::Triangle(TriangleRecord { p: [[1.0; 3]; 3], n: None, uv: None, shape: 0 });
+    let far =
+        Record::Triangle(TriangleRecord { p: [[1e30, 0.0, 0.0], [0.0; 3], [0.0; 3]], n: None, uv: None, shape: 0 });
+    let empty = run(&[flat, far], &settings(2, true), &store).unwrap_err();
+    assert!(matches!(empty, PrepareError::Empty { records: 2, degenerate: 1, out_of_range: 1, .. }), "{empty}");
+    assert!(matches!(run(&[flat], &settings(0, true), &store), Err(PrepareError::Settings(_))));
+    let lost = SpoolSettings { memory: 0, folder: Some("/nowhere/at/all".into()) };
+    let source = List::new(scene(1, 100));
+    let error = prepare(&description("list"), &source, &settings(2, true), &lost, &store, &NoProgress).unwrap_err();
+    assert!(matches!(error, PrepareError::Spool { .. }), "{error}");
+}
+
+#[test]
+fn one_primitive_and_flat_scenes_are_scenes() {
+    let wall = |x: f64| {
+        Record::Triangle(TriangleRecord {
+            p: [[x, 2.0, 0.0], [x + 1.0, 2.0, 0.0], [x, 2.0, 1.0]],
+            n: None,
+            uv: None,
+            shape: 0,
+        })
+    };
+    let store = MemoryObjects::new();
+    let one = run(&[wall(0.0)], &settings(5, true), &store).unwrap().manifest;
+    assert_eq!((one.splits.len(), one.grid.cells.len()), (1, 1));
+    let records: Vec<Record> = (0..50).map(|i| wall(f64::from(i % 7))).collect();
+    let flat = run(&records, &settings(6, true), &store).unwrap().manifest;
+    assert_eq!((flat.lo[1], flat.hi[1]), (0.0, 0.0));
+    Manifest::decode(&flat.encode()).unwrap();
+}
+
+/// Nearest hit as (t, id), of a forest of some splits.
+fn trace(forest: &Forest, tracer: &mut Tracer, ray: &Ray) -> Option<(f32, u64)> {
+    let mut hit = [Hit::miss(ray.tmax)];
+    tracer.closest(forest, &[*ray], &mut hit);
+    hit[0].is_hit().then(|| (hit[0].t, forest.prim_id(hit[0].prim)))
+}
+
+/// The point of it all: going from cell to cell finds the hit that the whole scene has, bit for bit.
+#[test]
+fn routing_finds_the_nearest_hit_of_the_whole_scene() {
+    let records = scene(10, 4000);
+    let mut random = Random(77);
+    for reduce in [true, false] {
+        let store = MemoryObjects::new();
+        let manifest = run(&records, &settings(13, reduce), &store).unwrap().manifest;
+        let grid = manifest.grid().unwrap();
+        let mut whole = Forest::new(64 << 20).unwrap();
+        let alone: Vec<Forest> = manifest
+            .splits
+            .iter()
+            .map(|split| {
+                let bytes = store.get(&split.geometry).unwrap();
+                let mut forest = Forest::new(8 << 20).unwrap();
+                forest.insert(&bytes).unwrap();
+                forest.finish().unwrap();
+                if !split.copied {
+                    whole.insert(&bytes).unwrap();
+                }
+                forest
+            })
+            .collect();
+        whole.finish().unwrap();
+        let mut tracer = Tracer::new(Kernel::Auto).unwrap();
+        let (mut hits, mut visits) = (0, 0);
+        for i in 0..4000 {
+            let mut point = |size: f64| -> [f32; 3] { std::array::from_fn(|_| (size * (random.next() - 0.5)) as f32) };
+            let (o, target) = (point(if i % 3 == 0 { 200.0 } else { 8.0 }), point(6.0));
+            let mut d: [f32; 3] = std::array::from_fn(|a| target[a] - o[a]);
+            if i % 5 == 0 {
+                d[i % 3] = 0.0;
+            }
+            let tmax = if i % 7 == 0 { 0.5 } else { f32::INFINITY };
+            let mut ray = Ray { o, tmin: 0.0, d, tmax };
+            let expected = trace(&whole, &mut tracer, &ray);
+            // go where the grid says, with the best hit so far
+            let mut best: Option<(f32, u64)> = None;
+            let mut from = Progress::START;
+            let mut resident = SplitSet::default();
+            while let Some(next) = grid.next_foreign(&ray, from, &resident) {
+                from = next.progress;
+                resident = next.owners.iter().copied().collect();
+                visits += 1;
+                for &owner in next.owners {
+                    if let Some(found) = trace(&alone[owner as usize], &mut tracer, &ray)
+                        && best.is_none_or(|b| found < b)
+                    {
+                        best = Some(found);
+                        ray.tmax = found.0;
+                    }
+                }
+            }
+            assert_eq!(best, expected, "ray {i}: {ray:?}");
+            hits += u32::from(expected.is_some());
+        }
+        assert!(hits > 1000, "{hits}");
+        assert!(visits < 4000 * 13, "{visits}");
     }
 }

@@ -2,6 +2,9 @@
 //!
 //! Below, u = 2^-53 and M is the lattice's magnitude: every coordinate of a vertex and of a plane is at most M.
 
+#[cfg(test)]
+mod tests;
+
 use super::Lattice;
 
 /// A box: lower and upper corner.
