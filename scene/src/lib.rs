@@ -3,6 +3,7 @@
 pub mod description;
 pub mod grid;
 pub mod import;
+pub mod inspect;
 pub mod manifest;
 pub mod objects;
 pub mod overlap;

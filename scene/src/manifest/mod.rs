@@ -2,7 +2,7 @@
 
 mod check;
 #[cfg(test)]
-mod tests;
+pub(crate) mod tests;
 
 use rayherd_render::filter::Filter;
 use rayherd_render::ray::PrimId;
