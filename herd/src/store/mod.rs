@@ -1,12 +1,16 @@
 //! Where blocks, ray groups and film parts live: one trait, several backends, layers around them.
 
+mod caching;
 #[cfg(any(test, feature = "testing"))]
 pub mod conformance;
+mod counting;
 mod directory;
 mod faulty;
 mod key;
 mod memory;
 mod objects;
+mod prefixed;
+mod replicated;
 mod retrying;
 mod s3;
 #[cfg(any(test, feature = "testing"))]
@@ -15,11 +19,15 @@ pub mod s3_server;
 use async_trait::async_trait;
 use bytes::Bytes;
 
+pub use caching::Caching;
+pub use counting::{Counters, Counting, kind_of_key};
 pub use directory::DirectoryStore;
 pub use faulty::{FaultPlan, Faulty, Injected};
 pub use key::{check_key, check_prefix};
 pub use memory::MemoryStore;
 pub use objects::{SceneObjects, object_key};
+pub use prefixed::Prefixed;
+pub use replicated::{NodeView, Replicated, ReplicationCounts, Verify};
 pub use retrying::{RetryPolicy, Retrying};
 pub use s3::{S3Credentials, S3Settings, S3Store};
 
