@@ -84,7 +84,7 @@ fn siblings_share_a_sequence() {
             for child in 0..split {
                 let x = Stream::new(5, 7, 2 * i + 1).vertex(1, split, child);
                 for d in 0..8 {
-                    let stratum = (u64::from(x[d]) * (n as u64 * u64::from(split)) >> 32) as usize;
+                    let stratum = ((u64::from(x[d]) * (n as u64 * u64::from(split))) >> 32) as usize;
                     assert!(!seen[stratum][d]);
                     seen[stratum][d] = true;
                 }
@@ -93,10 +93,13 @@ fn siblings_share_a_sequence() {
     }
 }
 
+/// Two numbers of a pixel's streams.
+type Pair = fn(u32) -> (u32, u32);
+
 /// Pairs of (neighbouring pixel, other half, other seed, other vertex, other dimension) fill the square evenly: no common scramble.
 #[test]
 fn keys_are_independent() {
-    let pairs: [(&str, fn(u32) -> (u32, u32)); 6] = [
+    let pairs: [(&str, Pair); 6] = [
         ("neighbours", |p| (Stream::new(1, p, 0).film()[0], Stream::new(1, p + 1, 0).film()[0])),
         ("rows", |p| (Stream::new(1, p, 0).film()[0], Stream::new(1, p + 256, 0).film()[0])),
         ("halves", |p| (Stream::new(1, p, 0).film()[0], Stream::new(1, p, 1).film()[0])),

@@ -249,7 +249,7 @@ fn nothing_is_nan() {
             let place = sizes[(rng.u32() % 5) as usize];
             let corner = rng.vec3(place);
             let shape = shapes[(rng.u32() % 2) as usize];
-            if rng.u32() % 3 == 0 {
+            if rng.u32().is_multiple_of(3) {
                 scene.sphere(shape, corner.to_array(), size.max(1e-6), rng.u32() & 1 == 0);
             } else {
                 scene.quad(shape, corner.to_array(), rng.vec3(size).to_array(), rng.vec3(size).to_array());

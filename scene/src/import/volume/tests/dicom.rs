@@ -1,11 +1,14 @@
 use super::*;
 
+/// Tag, value representation, value.
+type Element = ((u16, u16), &'static [u8; 2], Vec<u8>);
+
 /// A DICOM file of 3 x 2 pixels.
 #[derive(Clone)]
 pub(super) struct Image {
     pub syntax: &'static str,
     pub series: String,
-    pub elements: Vec<((u16, u16), &'static [u8; 2], Vec<u8>)>,
+    pub elements: Vec<Element>,
     pub pixels: Vec<u8>,
 }
 
