@@ -5,6 +5,7 @@ mod bounds;
 mod framing;
 pub mod isosurface;
 mod mesh;
+mod metals;
 mod mitsuba;
 mod obj;
 mod options;

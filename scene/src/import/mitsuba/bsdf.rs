@@ -4,6 +4,7 @@ use super::Converter;
 use super::xml::{ObjectId, malformed};
 use crate::ImportError;
 use crate::description::{Bsdf, Distribution, Material, Place};
+use crate::import::metals;
 
 /// Mitsuba's stand-in where a shape names no material, and ours for unsupported ones.
 const DEFAULT_REFLECTANCE: f32 = 0.5;
@@ -102,10 +103,13 @@ impl Converter<'_> {
         let k = self.color(id, "k", 3.0)?;
         let material = self.string(id, "material")?;
         let (eta, k) = match (eta, k, material) {
-            (None, None, Some((name, at))) if name != "none" => {
-                self.unsupported(at, format!("material \"{name}\""), "copper");
-                ([0.200438, 0.924033, 1.10221], [3.91295, 2.45285, 2.14219])
-            }
+            (None, None, Some((name, at))) if name != "none" => match metals::find(name) {
+                Some(metal) => (metal.eta.map(f64::from), metal.k.map(f64::from)),
+                None => {
+                    self.unsupported(at, format!("material \"{name}\""), "copper");
+                    metals::find("Cu").map_or(([0.0; 3], [1.0; 3]), |m| (m.eta.map(f64::from), m.k.map(f64::from)))
+                }
+            },
             // Mitsuba's default: a perfect mirror
             (eta, k, _) => (eta.unwrap_or([0.0; 3]), k.unwrap_or([1.0; 3])),
         };
