@@ -10,6 +10,7 @@ pub mod overlap;
 pub mod prepare;
 pub mod record;
 pub mod split;
+pub mod tools;
 
 use std::path::PathBuf;
 

@@ -106,7 +106,7 @@ fn vertex_normals(reader: &mut impl TriangleReader) -> Result<Option<Vec<[f64; 3
         }
         let needed = corners.vertices.into_iter().max().unwrap_or(0) + 1;
         if needed > sums.len() {
-            let grown = needed.next_multiple_of(1 << 16);
+            let grown = needed.max(sums.len() + sums.len() / 2);
             if !reader.budget().take(((grown - sums.len()) * size_of::<[f64; 3]>()) as u64) {
                 return reader.source().fail_limit(
                     "smooth normals of so many vertices exceed the vertex budget: write normals into the file, set \

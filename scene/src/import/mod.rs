@@ -27,6 +27,7 @@ pub use options::{
     CameraView, DEFAULT_ALBEDO, ImportOptions, Light, OptionError, parse_albedo, parse_define, parse_radiance,
 };
 pub use placement::Placement;
+pub(crate) use spill::temporary_file;
 pub use stream::{DescriptionSource, StreamOptions};
 
 use crate::ImportError;
@@ -47,9 +48,34 @@ enum Kind {
 /// # Errors
 /// The file cannot be read, is malformed, has elements that are not supported (all are listed), or gives no light.
 pub fn import(path: &Path, options: &ImportOptions) -> Result<Description, ImportError> {
+    let (mut out, up, bare) = read(path, options)?;
+    place_camera(path, &mut out, up, bare, options)?;
+    if let Some(sky) = options.sky {
+        out.environment = Some(sky);
+    }
+    out.environment = out.environment.filter(|rgb| rgb.iter().any(|v| *v > 0.0));
+    if out.environment.is_none() && out.shapes.iter().all(|s| s.emission.is_none()) {
+        return refuse(
+            path,
+            "nothing in this scene emits light, its image is black: add an emitter, or pass --light or --sky",
+        );
+    }
+    Ok(out)
+}
+
+/// Reads the shapes of a scene as they are: no camera or light is added, and none is asked for.
+///
+/// # Errors
+/// As [`import`], but for light.
+pub fn import_surface(path: &Path, options: &ImportOptions) -> Result<Description, ImportError> {
+    Ok(read(path, options)?.0)
+}
+
+/// What the source says, which way is up, and whether it is a surface without a scene.
+fn read(path: &Path, options: &ImportOptions) -> Result<(Description, Up, bool), ImportError> {
     let kind = kind(path)?;
     let bare = !matches!(kind, Kind::Mitsuba);
-    let (mut out, up) = match kind {
+    let (out, up) = match kind {
         Kind::Mitsuba => {
             for (given, name) in [(options.iso.is_some(), "an iso value"), (options.albedo.is_some(), "an albedo")] {
                 if given {
@@ -64,6 +90,12 @@ pub fn import(path: &Path, options: &ImportOptions) -> Result<Description, Impor
         Kind::Mesh(format) => bare::meshes(path, &[(path.to_path_buf(), format)], options)?,
         Kind::Volume => bare::volume(path, options)?,
         Kind::Folder => match bare::meshes_in(path)? {
+            meshes if meshes.is_empty() && options.iso.is_none() => {
+                return refuse(
+                    path,
+                    "no .ply, .obj or .stl in this folder; if it holds a DICOM series, pass --iso VALUE, if a scene, name its file",
+                );
+            }
             meshes if meshes.is_empty() => bare::volume(path, options)?,
             meshes => bare::meshes(path, &meshes, options)?,
         },
@@ -71,21 +103,10 @@ pub fn import(path: &Path, options: &ImportOptions) -> Result<Description, Impor
     if out.shapes.is_empty() {
         return refuse(path, "the scene has no shapes: there is nothing to render");
     }
-    place_camera(path, &mut out, up, bare, options)?;
-    if let Some(sky) = options.sky {
-        out.environment = Some(sky);
-    }
-    out.environment = out.environment.filter(|rgb| rgb.iter().any(|v| *v > 0.0));
-    if out.environment.is_none() && out.shapes.iter().all(|s| s.emission.is_none()) {
-        return refuse(
-            path,
-            "nothing in this scene emits light, its image is black: add an emitter, or pass --light or --sky",
-        );
-    }
     for s in &out.substitutions {
         tracing::warn!("{}: {} is not supported; in its place: {}", s.place, s.what, s.stand_in);
     }
-    Ok(out)
+    Ok((out, up, bare))
 }
 
 /// The camera that was asked for, or one that frames the scene if it has none; and the lights.

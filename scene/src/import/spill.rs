@@ -61,10 +61,10 @@ impl Budget {
 }
 
 /// A file without a name.
-fn temporary_file(folder: &std::path::Path) -> io::Result<File> {
+pub(crate) fn temporary_file(folder: &std::path::Path) -> io::Result<File> {
     static NUMBER: AtomicU64 = AtomicU64::new(0);
     loop {
-        let name = format!("rayherd-vertices-{}-{}", std::process::id(), NUMBER.fetch_add(1, Ordering::Relaxed));
+        let name = format!(".rayherd-{}-{}", std::process::id(), NUMBER.fetch_add(1, Ordering::Relaxed));
         let path = folder.join(name);
         match OpenOptions::new().read(true).write(true).create_new(true).open(&path) {
             Ok(file) => {

@@ -1,7 +1,7 @@
 //! Materials.
 
 use super::Converter;
-use super::xml::{ObjectId, malformed};
+use super::xml::{ObjectId, Property, Value, malformed};
 use crate::ImportError;
 use crate::description::{Bsdf, Distribution, Material, Place};
 use crate::import::metals;
@@ -76,6 +76,26 @@ impl Converter<'_> {
                 self.ignore(id, &["sample_visible"]);
                 (Bsdf::RoughConductor { distribution, alpha, eta, k, specular }, false)
             }
+            plugin @ ("bumpmap" | "normalmap" | "mask" | "opacity") => {
+                self.unsupported(place, format!("bsdf \"{plugin}\""), "the material inside");
+                let inner = self.nested(id, "bsdf")?;
+                object.properties.iter().for_each(|p| p.used.set(true));
+                match inner[..] {
+                    [(p, inner), ..] => self.bsdf(inner, &p.place)?,
+                    [] => return malformed(place, format!("{plugin} needs a material inside")),
+                }
+            }
+            plugin @ ("plastic" | "roughplastic" | "roughdiffuse" | "phong" | "ward" | "principled") => {
+                self.unsupported(place, format!("bsdf \"{plugin}\""), "diffuse of its diffuse colour, two-sided");
+                object.properties.iter().for_each(|p| p.used.set(true));
+                let name =
+                    |p: &&Property| ["diffuse_reflectance", "reflectance", "base_color"].contains(&p.name.as_str());
+                let reflectance = match object.properties.iter().find(name).map(|p| &p.value) {
+                    Some(Value::Color(rgb)) => rgb.map(|v| v.clamp(0.0, 1.0) as f32),
+                    _ => [DEFAULT_REFLECTANCE; 3],
+                };
+                (Bsdf::Diffuse { reflectance }, true)
+            }
             plugin => {
                 self.unsupported(place, format!("bsdf \"{plugin}\""), "grey diffuse, two-sided");
                 object.properties.iter().for_each(|p| p.used.set(true));
@@ -118,9 +138,9 @@ impl Converter<'_> {
         }
         let outside = match self.property(id, "ext_eta").map(|p| (&p.value, &p.place)) {
             None => 1.0,
-            Some((super::Value::Float(v), _)) if *v > 0.0 => *v,
-            Some((super::Value::String(name), _)) if name == "air" => 1.000277,
-            Some((super::Value::String(name), _)) if name == "vacuum" => 1.0,
+            Some((Value::Float(v), _)) if *v > 0.0 => *v,
+            Some((Value::String(name), _)) if name == "air" => 1.000277,
+            Some((Value::String(name), _)) if name == "vacuum" => 1.0,
             Some((_, at)) => {
                 self.unsupported(at, "this ext_eta", "1");
                 1.0

@@ -10,6 +10,9 @@
 //! - The sampler's kind is ignored, its `sample_count` is used.
 //! - Clip planes and focus distance of a perspective sensor are ignored: nothing is clipped.
 //! - A scene without a sensor is framed by the rule for bare meshes ([`super::framing`]).
+//! - The axis of a rotation is brought to unit length, as in 0.6; Mitsuba 3 does not, and then shears.
+//! - A mirroring `to_world` leaves the front of a mesh where its normals are, as Mitsuba does from 3.10 on; 3.9 turned round the
+//!   front of mirrored meshes that have no normals.
 
 mod bsdf;
 mod emitter;

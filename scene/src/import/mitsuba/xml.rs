@@ -241,7 +241,8 @@ impl Reader {
         let text = String::from_utf8(text).map_err(|e| {
             whole(format!("byte {} is not UTF-8; save the file as UTF-8", e.utf8_error().valid_up_to()))
         })?;
-        if let Some(offset) = crowded_element(&text) {
+        let text = text.strip_prefix('\u{feff}').unwrap_or(&text);
+        if let Some(offset) = crowded_element(text) {
             let line = text[..offset].lines().count() as u32;
             return malformed(
                 &Place { file: path.into(), line },
@@ -249,7 +250,7 @@ impl Reader {
             );
         }
         let options = roxmltree::ParsingOptions { nodes_limit: MAX_NODES, ..Default::default() };
-        let xml = roxmltree::Document::parse_with_options(&text, options).map_err(|e| ImportError::Malformed {
+        let xml = roxmltree::Document::parse_with_options(text, options).map_err(|e| ImportError::Malformed {
             place: Place { file: path.into(), line: e.pos().row },
             message: format!("not well-formed XML: {e}"),
         })?;
