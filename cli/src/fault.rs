@@ -2,6 +2,7 @@
 
 use std::io;
 
+use rayherd_herd::job::JobError;
 use rayherd_scene::ImportError;
 use rayherd_scene::manifest::ManifestError;
 use rayherd_scene::objects::ObjectError;
@@ -31,6 +32,7 @@ fn is_users(cause: &(dyn std::error::Error + 'static)) -> bool {
             | PrepareError::TooManySplits(_) => true,
             PrepareError::Inconsistent(_) | PrepareError::Spool { .. } => false,
         })
+        || cause.downcast_ref().is_some_and(JobError::is_users)
         || cause.downcast_ref().is_some_and(|e| match e {
             ManifestError::Malformed(_) | ManifestError::Format { .. } => true,
             ManifestError::Store(e) => object_is_users(e),

@@ -2,10 +2,16 @@
 
 mod commands;
 mod fault;
+mod frames;
+mod image_options;
+mod job_file;
 mod log;
 mod options;
 mod output;
+mod progress;
+mod run_options;
 mod source;
+mod spilling;
 
 use std::process::ExitCode;
 

@@ -1,6 +1,6 @@
 //! From a job to its prepared scene: what `render`, `prepare` and `replay` begin with.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use anyhow::Context;
@@ -79,5 +79,39 @@ impl PrepareProgress for StageBar {
     }
     fn advance(&self, steps: u64) {
         self.0.inc(steps);
+    }
+}
+/// `cornell-box` of `examples/cornell-box.xml`, `chest` of `scans/chest/`, `head` of `head.nii.gz`.
+pub fn name(source: &str) -> String {
+    let path = PathBuf::from(source.trim_end_matches('/'));
+    let path = std::fs::canonicalize(&path).unwrap_or(path);
+    let name = path.file_name().map_or_else(|| "scene".into(), |n| n.to_string_lossy().into_owned());
+    if path.is_dir() {
+        return name;
+    }
+    let name = name.strip_suffix(".gz").unwrap_or(&name);
+    match name.rsplit_once('.') {
+        Some((stem, _)) if !stem.is_empty() => stem.to_owned(),
+        _ => name.to_owned(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_scene_is_named_after_its_file() {
+        for (source, want) in [
+            ("none/cornell-box.xml", "cornell-box"),
+            ("head.nii.gz", "head"),
+            ("chest/", "chest"),
+            (".hidden", ".hidden"),
+            ("/", "scene"),
+        ] {
+            assert_eq!(name(source), want);
+        }
+        assert_eq!(name("src"), "src");
+        assert_eq!(name("."), "cli");
     }
 }

@@ -4,7 +4,7 @@ mod common;
 
 use common::rayherd;
 
-const COMMANDS: [&str; 3] = ["compare", "inspect", "prepare"];
+const COMMANDS: [&str; 4] = ["render", "prepare", "inspect", "compare"];
 
 #[test]
 fn every_command_has_help_with_an_example() {

@@ -7,12 +7,13 @@ use std::process::ExitCode;
 
 use anyhow::Context;
 use clap::Args;
+use rayherd_herd::job::Image;
 use serde::Serialize;
 
 use super::print;
 use crate::fault::Mistake;
 use crate::output::exr_file::{self, Channels};
-use crate::output::{Picture, png_file, replace};
+use crate::output::{png_file, replace};
 
 /// Compare two EXR pictures, B being the reference; prints JSON
 ///
@@ -179,7 +180,7 @@ fn difference(a: &Channels, b: &Channels) -> anyhow::Result<Vec<u8>> {
         ((a - b).abs() / (b.abs() + 0.1)) as f32
     };
     let pixels = (0..a.width * a.height).map(|i| std::array::from_fn(|c| value(&names[c], i))).collect();
-    Ok(png_file::encode(&Picture { width: a.width as u32, pixels }, 0.0)?)
+    Ok(png_file::encode(&Image { width: a.width as u32, height: a.height as u32, pixels }, 0.0)?)
 }
 
 #[cfg(test)]

@@ -6,19 +6,22 @@ use std::process::ExitCode;
 
 use anyhow::Context;
 use clap::Args;
-use rayherd_scene::manifest::{Manifest, StoppedBy};
+use rayherd_scene::inspect::{Picture, picture, summary};
+use rayherd_scene::manifest::Manifest;
 use rayherd_scene::objects::{DirectoryObjects, ObjectRef, ObjectStore};
 
 use super::print;
 use crate::fault::Mistake;
-use crate::output::{grid_picture, replace};
+use crate::output::{png_file, replace};
 
 /// Show what a prepared scene is made of: splits, cells, owners, copies, sizes
 #[derive(Args)]
-#[command(after_help = "The picture shows the scheduling grid layer by layer along z, from left to right and top to \
-    bottom; in a layer x grows to the right and y upwards. An occupied cell has the colour of its first owner, with \
-    a white corner where it has several; what is dark is empty.\n\n\
-    Examples:\n  rayherd inspect prepared\n  rayherd inspect prepared --splits --picture grid.png")]
+#[command(
+    after_help = "The picture shows the scheduling grid as slices along z, from the lowest at the top left, row by \
+    row; in a slice x goes right and y up. A cell has the colour of its owner; one with several owners shows two of \
+    them in a checkerboard with a white rim.\n\n\
+    Examples:\n  rayherd inspect prepared\n  rayherd inspect prepared --splits --picture grid.png"
+)]
 pub struct Arguments {
     /// A folder that `rayherd prepare` filled
     prepared: PathBuf,
@@ -36,12 +39,13 @@ pub struct Arguments {
 /// Reads the manifest and prints.
 pub fn run(arguments: &Arguments) -> anyhow::Result<ExitCode> {
     let (object, manifest) = choose(&arguments.prepared, arguments.scene.as_deref())?;
-    let mut text = summary(&object, &manifest);
+    let mut text = format!("scene        {}\n{}", object.hash, summary(&manifest));
     if arguments.splits {
         text += &split_table(&manifest);
     }
     if let Some(path) = &arguments.picture {
-        let png = grid_picture::draw(&manifest.grid).context("cannot draw the grid")?;
+        let Picture { width, height, rgb } = picture(&manifest);
+        let png = png_file::encode_rgb8(width, height, &rgb).context("cannot draw the grid")?;
         replace::replace(path, &png).map_err(|e| Mistake(format!("cannot write {}: {e}", path.display())))?;
         let _ = writeln!(text, "picture      {}", path.display());
     }
@@ -79,54 +83,6 @@ fn choose(folder: &Path, wanted: Option<&str>) -> anyhow::Result<(ObjectRef, Man
                 .into())
         }
     }
-}
-
-fn summary(object: &ObjectRef, m: &Manifest) -> String {
-    let (source, copied): (Vec<_>, Vec<_>) = m.splits.iter().partition(|s| !s.copied);
-    let sum = |splits: &[&rayherd_scene::manifest::SplitEntry]| {
-        splits.iter().fold((0, 0), |(g, a), s| (g + s.geometry.bytes, a + s.attributes.bytes))
-    };
-    let (geometry, attributes) = sum(&source);
-    let (copied_geometry, copied_attributes) = sum(&copied);
-    let c = &m.counts;
-    let cells = &m.grid.cells;
-    let contested = cells.iter().filter(|cell| cell.owners.len() > 1).count();
-    let most_owners = cells.iter().map(|cell| cell.owners.len()).max().unwrap_or(0);
-    let stopped = match m.choice.stopped_by {
-        StoppedBy::Threshold => "the share of contested primitives is low enough",
-        StoppedBy::Several => "there are several times as many cells as splits",
-        StoppedBy::Limit => "it is the largest subdivision allowed",
-    };
-    let share = m.choice.candidates.iter().find(|x| x.subdiv == m.grid.subdiv).map_or(0.0, |x| x.contested_share());
-    let skipped = c.degenerate + c.non_finite + c.out_of_range;
-    let mut t = String::new();
-    let mut line = |name: &str, text: String| t += &format!("{name:<12} {text}\n");
-    line("scene", object.hash.to_string());
-    line("content", m.content.to_string());
-    line("primitives", format!("{} triangles, {} spheres, {skipped} skipped", c.triangles, c.spheres));
-    line("box", format!("{:?} to {:?}, recentred by {:?}", m.lo, m.hi, m.offset));
-    line("splits", format!("{}: geometry {}, attributes {}", source.len(), size(geometry), size(attributes)));
-    line(
-        "copied",
-        format!(
-            "{} splits, {} primitives: geometry {}, attributes {}",
-            copied.len(),
-            m.choice.copies,
-            size(copied_geometry),
-            size(copied_attributes)
-        ),
-    );
-    line("grid", format!("{0} x {0} x {0}, {1} cells occupied; {stopped}", m.grid.subdiv, cells.len()));
-    line(
-        "contested",
-        format!("{} cells before overlap reduction, share {share:.3}; {contested} after", m.choice.contested_cells),
-    );
-    line("owners", format!("at most {most_owners} for a cell"));
-    line("source", format!("read {} times, {}", c.source_reads, size(c.source_bytes)));
-    for s in &m.defaults.substitutions {
-        line("stand-in", format!("{}: {} for {}", s.place, s.stand_in, s.what));
-    }
-    t
 }
 
 fn split_table(m: &Manifest) -> String {

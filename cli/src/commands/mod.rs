@@ -3,6 +3,7 @@
 mod compare;
 mod inspect;
 mod prepare;
+mod render;
 
 use std::io::Write;
 use std::process::ExitCode;
@@ -12,14 +13,16 @@ use clap::Subcommand;
 /// What to do.
 #[derive(Subcommand)]
 pub enum Command {
-    Compare(compare::Arguments),
-    Inspect(inspect::Arguments),
+    Render(Box<render::Arguments>),
     Prepare(prepare::Arguments),
+    Inspect(inspect::Arguments),
+    Compare(compare::Arguments),
 }
 
 /// Does it. The code is the command's answer; an error is told by the caller.
 pub fn run(command: Command) -> anyhow::Result<ExitCode> {
     match command {
+        Command::Render(arguments) => render::run(&arguments),
         Command::Compare(arguments) => compare::run(&arguments),
         Command::Inspect(arguments) => inspect::run(&arguments),
         Command::Prepare(arguments) => prepare::run(&arguments),

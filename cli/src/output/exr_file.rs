@@ -10,9 +10,9 @@ use exr::prelude::{
     Encoding, FlatImage, FlatSamples, Image, ImageAttributes, IntegerBounds, Layer, LayerAttributes, MetaData,
     ReadChannels, ReadLayers, SpecificChannels, Text, WritableImage,
 };
+use rayherd_herd::job::Image as Picture;
 use serde_json::{Map, Value};
 
-use super::Picture;
 use crate::fault::Mistake;
 
 /// The attribute that holds what defines the image, as one JSON object.
@@ -22,14 +22,13 @@ pub const ATTRIBUTE: &str = "rayherd";
 
 /// Encodes `picture` with `definition` in its header. The same arguments give the same bytes: compression and order of
 /// lines are fixed, and nothing tells of time, host or threads.
-#[cfg_attr(not(test), expect(dead_code, reason = "rendering, which comes with herd's job, is its only user"))]
 pub fn encode(picture: &Picture, definition: &Map<String, Value>) -> anyhow::Result<Vec<u8>> {
     let width = picture.width as usize;
     let channels = SpecificChannels::rgb(|at: exr::math::Vec2<usize>| {
         let [r, g, b] = picture.pixels[at.y() * width + at.x()];
         (r, g, b)
     });
-    let size = (width, picture.height() as usize);
+    let size = (width, picture.height as usize);
     let encoding = Encoding { line_order: exr::meta::attribute::LineOrder::Increasing, ..Encoding::SMALL_LOSSLESS };
     let mut attributes = LayerAttributes::default();
     let text = Value::Object(definition.clone()).to_string();
@@ -115,7 +114,7 @@ mod tests {
 
     fn picture() -> Picture {
         let pixels = (0..70 * 40).map(|i| [i as f32, -0.5 * i as f32, 1.0 / (1.0 + i as f32)]).collect();
-        Picture { width: 70, pixels }
+        Picture { width: 70, height: 40, pixels }
     }
 
     fn definition() -> Map<String, Value> {

@@ -2,13 +2,13 @@
 
 use std::io;
 
-use super::Picture;
+use rayherd_herd::job::Image;
 
 /// Encodes `picture` times 2^`exposure` as an sRGB PNG; values are cut to [0, 1], and what is no number is magenta.
-pub fn encode(picture: &Picture, exposure: f64) -> io::Result<Vec<u8>> {
+pub fn encode(picture: &Image, exposure: f64) -> io::Result<Vec<u8>> {
     let gain = libm::exp2(exposure);
     let texels: Vec<u8> = picture.pixels.iter().flat_map(|&p| srgb8(p, gain)).collect();
-    encode_rgb8(picture.width, picture.height(), &texels)
+    encode_rgb8(picture.width, picture.height, &texels)
 }
 
 /// Encodes sRGB bytes, rows from the top.
@@ -53,7 +53,7 @@ mod tests {
         assert_eq!(srgb8([-1.0, 2.0, f32::INFINITY], 1.0), [0, 255, 255]);
         assert_eq!(srgb8([0.0, f32::NAN, 0.0], 1.0), [255, 0, 255]);
 
-        let picture = Picture { width: 2, pixels: vec![[1.0, 0.0, 0.0], [0.0; 3], [0.0; 3], [0.0, 0.0, 0.5]] };
+        let picture = Image { width: 2, height: 2, pixels: vec![[1.0, 0.0, 0.0], [0.0; 3], [0.0; 3], [0.0, 0.0, 0.5]] };
         let bytes = encode(&picture, 1.0).unwrap();
         let mut reader = png::Decoder::new(io::Cursor::new(&bytes)).read_info().unwrap();
         let mut texels = vec![0; reader.output_buffer_size().unwrap()];

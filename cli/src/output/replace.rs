@@ -9,7 +9,6 @@ use anyhow::{Context, anyhow};
 use crate::fault::Mistake;
 
 /// Whether `path` can be replaced, found out before any work is done: a file is made beside it and removed again.
-#[cfg_attr(not(test), expect(dead_code, reason = "rendering, which comes with herd's job, is its only user"))]
 pub fn probe(path: &Path) -> anyhow::Result<()> {
     if path.is_dir() {
         return Err(Mistake(format!("cannot write {}: it is a folder; name a file", path.display())).into());
@@ -34,7 +33,6 @@ pub fn replace(path: &Path, bytes: &[u8]) -> io::Result<()> {
 
 /// Replaces `path` by `bytes`, or else writes them to the first place that takes them: the working folder, then the
 /// system's folder for temporary files. An error always says where the bytes are, if anywhere.
-#[expect(dead_code, reason = "rendering, which comes with herd's job, is its only user")]
 pub fn replace_or_keep(path: &Path, bytes: &[u8]) -> anyhow::Result<()> {
     replace_or_keep_in(path, bytes, &[PathBuf::from("."), std::env::temp_dir()])
 }

@@ -1,0 +1,216 @@
+//! `rayherd render`: from a scene to an EXR and a PNG.
+
+use std::num::NonZeroU32;
+use std::path::PathBuf;
+use std::process::ExitCode;
+use std::sync::Arc;
+
+use anyhow::Context;
+use clap::Args;
+use rayherd_api::{RenderJob, RenderJobSpec};
+use rayherd_herd::job::{JobSettings, PreparedScene, Sampling};
+use rayherd_herd::local::{JobOutcome, render_local};
+use rayherd_herd::report::Report;
+use rayherd_scene::objects::ObjectStore;
+use rayherd_scene::prepare::Prepared;
+use serde_json::json;
+
+use super::print;
+use crate::frames::{self, Shot};
+use crate::image_options::ImageOptions;
+use crate::job_file::read_job;
+use crate::options::{self, CutOptions, SceneOptions, set};
+use crate::output::{exr_file, png_file, replace};
+use crate::progress::{Display, si};
+use crate::run_options::RunOptions;
+use crate::source;
+use crate::spilling::SpillingObjects;
+
+/// Objects of the prepared scene that stay in memory; what is more goes to a temporary folder.
+const OBJECTS_IN_MEMORY: u64 = 256 << 20;
+
+/// Render a scene to an EXR (linear) and a PNG (sRGB)
+///
+/// While it runs, the PNG is a preview. A scene file's own camera, size, samples and depth hold unless a flag or a job
+/// file says otherwise; a mesh or volume is framed by a camera and lit by two area lights and a sky.
+#[derive(Args)]
+#[command(after_help = "Examples:\n  rayherd render examples/cornell-box.xml\n  \
+    rayherd render bunny.ply -o bunny.exr --spp 256 --albedo 0.8,0.6,0.4\n  \
+    rayherd render chest-ct --iso -789.5 --size 512x512 --target-error 0.01\n  \
+    rayherd render scene.xml --nodes 4 --slots 2,2,4,4 --memory 64Mi --splits 32 --report r.json\n  \
+    rayherd render -f job.yaml")]
+pub struct Arguments {
+    /// Mitsuba XML, mesh (PLY, OBJ, STL), folder of meshes, or CT volume (DICOM folder, NRRD, NIfTI)
+    #[arg(required_unless_present = "file")]
+    scene: Option<String>,
+    /// Take the job from a RenderJob in YAML; flags win over it
+    #[arg(short, long, value_name = "YAML")]
+    file: Option<PathBuf>,
+    /// The EXR; the PNG goes beside it [default: ./SCENE.exr]
+    #[arg(short, long, value_name = "EXR")]
+    output: Option<String>,
+    /// Exposure of the PNG in stops [default: 0]
+    #[arg(long, value_name = "STOPS", allow_hyphen_values = true)]
+    exposure: Option<f64>,
+    /// Write previews to this PNG instead of the final one's place
+    #[arg(long, value_name = "PNG")]
+    preview: Option<PathBuf>,
+    /// Write what was done and counted as JSON (an array when there are several cameras)
+    #[arg(long, value_name = "JSON")]
+    report: Option<PathBuf>,
+    #[command(flatten)]
+    image: ImageOptions,
+    #[command(flatten)]
+    sampling: SamplingOptions,
+    #[command(flatten)]
+    scene_options: SceneOptions,
+    #[command(flatten)]
+    cut: CutOptions,
+    #[command(flatten)]
+    run: RunOptions,
+}
+
+/// How many samples.
+#[derive(Args)]
+#[command(next_help_heading = "Sampling")]
+struct SamplingOptions {
+    /// Samples per pixel; with a target error or time limit, the most [default: the scene's, or 64]
+    #[arg(long, value_name = "N", allow_hyphen_values = true)]
+    spp: Option<i32>,
+    /// Stop when the estimated relative squared error (relMSE) is at most this, such as 0.01
+    #[arg(long, value_name = "E", allow_hyphen_values = true)]
+    target_error: Option<f64>,
+    /// Start no further step of samples after so many seconds
+    #[arg(long, value_name = "SECONDS", allow_hyphen_values = true)]
+    time_limit: Option<f64>,
+}
+
+/// Renders every frame of the job.
+pub fn run(arguments: &Arguments) -> anyhow::Result<ExitCode> {
+    let job = job(arguments)?;
+    let settings = arguments.run.settings(&job.spec)?;
+    use_threads(settings.threads)?;
+    let files = frames::files(&job);
+    let pictures = files.iter().flat_map(|exr| [exr.clone(), exr.with_extension("png")]);
+    for path in pictures.chain(arguments.preview.clone()).chain(arguments.report.clone()) {
+        replace::probe(&path)?;
+    }
+
+    let objects: Arc<dyn ObjectStore> = Arc::new(SpillingObjects::new(OBJECTS_IN_MEMORY));
+    let (_, prepared) = source::open(&job.spec, &objects)?;
+    let shots = frames::shots(&job, &prepared.manifest)?;
+    let scene = PreparedScene::open(prepared.manifest.clone(), objects)?;
+    let sampling = Sampling {
+        spp: frames::samples(&job, &prepared.manifest),
+        target_error: job.spec.sampling.target_error,
+        time_limit: job.spec.sampling.time_limit,
+    };
+    let exposure = job.spec.image.exposure.unwrap_or(0.0);
+    let mut reports = Vec::new();
+    for shot in &shots {
+        let preview = arguments.preview.clone().unwrap_or_else(|| shot.png());
+        let mut outcome = render(&scene, shot, &sampling, &settings, (preview, exposure))?;
+        outcome.report.prepare = prepare_report(&prepared);
+        save(&scene, shot, &outcome, exposure)?;
+        tell(shot, &outcome.report, &sampling)?;
+        reports.push(outcome.report);
+    }
+    if let Some(path) = &arguments.report {
+        let json = match &reports[..] {
+            [one] => serde_json::to_vec_pretty(one)?,
+            many => serde_json::to_vec_pretty(many)?,
+        };
+        replace::replace_or_keep(path, &[&json[..], b"\n"].concat())?;
+    }
+    Ok(ExitCode::SUCCESS)
+}
+
+/// The job of file and flags, checked.
+fn job(arguments: &Arguments) -> anyhow::Result<RenderJob> {
+    let mut job = match &arguments.file {
+        Some(file) => {
+            let job = read_job(file)?;
+            options::check(&job, Some(file))?;
+            job
+        }
+        None => RenderJob::new(RenderJobSpec::default()),
+    };
+    let spec = &mut job.spec;
+    if let Some(scene) = &arguments.scene {
+        spec.scene.source.clone_from(scene);
+    }
+    arguments.scene_options.apply(spec);
+    arguments.cut.apply(spec);
+    arguments.image.apply(spec);
+    arguments.run.apply(spec);
+    set(&mut spec.sampling.spp, arguments.sampling.spp);
+    set(&mut spec.sampling.target_error, arguments.sampling.target_error);
+    set(&mut spec.sampling.time_limit, arguments.sampling.time_limit);
+    set(&mut spec.image.output, arguments.output.clone());
+    set(&mut spec.image.exposure, arguments.exposure);
+    options::check(&job, None)?;
+    Ok(job)
+}
+
+/// Preparing and encoding keep to the threads that were asked for, too.
+fn use_threads(threads: Option<NonZeroU32>) -> anyhow::Result<()> {
+    let Some(threads) = threads else { return Ok(()) };
+    let pool = rayon::ThreadPoolBuilder::new().num_threads(threads.get() as usize);
+    pool.build_global().context("cannot start threads")
+}
+
+fn render(
+    scene: &PreparedScene,
+    shot: &Shot,
+    sampling: &Sampling,
+    settings: &JobSettings,
+    preview: (PathBuf, f64),
+) -> anyhow::Result<JobOutcome> {
+    let [width, height] = shot.frame.size;
+    let display = Display::new(u64::from(width) * u64::from(height), sampling.target_error, Some(preview));
+    let outcome = render_local(scene, &shot.frame, sampling, settings, &display);
+    display.finish();
+    outcome.with_context(|| format!("cannot render {}", shot.exr.display()))
+}
+
+fn save(scene: &PreparedScene, shot: &Shot, outcome: &JobOutcome, exposure: f64) -> anyhow::Result<()> {
+    let definition = frames::definition(&scene.manifest, &shot.frame, outcome.spp)?;
+    replace::replace_or_keep(&shot.exr, &exr_file::encode(&outcome.image, &definition)?)?;
+    replace::replace_or_keep(&shot.png(), &png_file::encode(&outcome.image, exposure)?)
+}
+
+fn prepare_report(prepared: &Prepared) -> serde_json::Value {
+    let m = &prepared.manifest;
+    json!({
+        "reused": prepared.reused,
+        "scene": prepared.reference.hash,
+        "subdiv": m.grid.subdiv,
+        "splits": m.splits.iter().filter(|s| !s.copied).count(),
+        "copied_splits": m.splits.iter().filter(|s| s.copied).count(),
+        "choice": m.choice,
+        "contested_share": m.choice.candidates.iter().find(|c| c.subdiv == m.grid.subdiv).map(|c| c.contested_share()),
+        "counts": m.counts,
+        "took": prepared.report,
+        "substitutions": m.defaults.substitutions,
+    })
+}
+
+/// Where the pictures are, how noisy, what it took.
+fn tell(shot: &Shot, report: &Report, sampling: &Sampling) -> anyhow::Result<()> {
+    let [width, height] = shot.frame.size;
+    let error = report.rel_mse.map_or_else(|| "relMSE unknown".into(), |e| format!("relMSE {e:.2e}"));
+    let target = match (report.target_reached, sampling.target_error) {
+        (Some(true), Some(target)) => format!(" (target {target} reached)"),
+        (Some(false), Some(target)) => format!(" (target {target} not reached: give more --spp or time)"),
+        _ => String::new(),
+    };
+    let rays = report.rays.closest + report.rays.shadow;
+    print(&format!(
+        "{} and {}: {width}x{height}, {} spp, {error}{target}, {} rays, {:.2} CPU-seconds\n",
+        shot.exr.display(),
+        shot.png().display(),
+        report.spp,
+        si(rays as f64),
+        report.cpu_s
+    ))
+}

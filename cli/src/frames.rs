@@ -1,0 +1,177 @@
+//! The frames of a job: which camera, which file.
+
+use std::path::{Path, PathBuf};
+
+use anyhow::Context;
+use rayherd_api::{CameraSpec, RenderJob};
+use rayherd_render::camera::Camera;
+use rayherd_render::filter::Filter;
+use rayherd_render::frame::Frame;
+use rayherd_scene::import::CameraView;
+use rayherd_scene::manifest::Manifest;
+use serde_json::{Map, Value, json};
+
+use crate::fault::Mistake;
+use crate::source;
+
+/// What Mitsuba renders when nothing is said.
+const DEFAULT_SIZE: [u32; 2] = [768, 576];
+/// Enough for every scene that ends paths by Russian roulette.
+const DEFAULT_MAX_DEPTH: u32 = 65;
+/// Mitsuba's.
+const DEFAULT_RR_DEPTH: u32 = 5;
+/// Enough to see what is what.
+const DEFAULT_SPP: u32 = 64;
+
+/// One picture of a job.
+pub struct Shot {
+    /// What defines it besides the scene.
+    pub frame: Frame,
+    /// Where it goes; the PNG stands beside it.
+    pub exr: PathBuf,
+}
+
+impl Shot {
+    /// The PNG beside the EXR.
+    pub fn png(&self) -> PathBuf {
+        self.exr.with_extension("png")
+    }
+}
+
+/// The shots of a job that was checked, in its order.
+pub fn shots(job: &RenderJob, manifest: &Manifest) -> anyhow::Result<Vec<Shot>> {
+    let files = files(job);
+    let cameras = &job.spec.image.cameras;
+    if cameras.is_empty() {
+        return Ok(vec![Shot { frame: frame(job, manifest, None)?, exr: files[0].clone() }]);
+    }
+    cameras.iter().zip(files).map(|(c, exr)| Ok(Shot { frame: frame(job, manifest, Some(c))?, exr })).collect()
+}
+
+/// Where the pictures go, known before the scene is read: one for each camera, one when there is none.
+pub fn files(job: &RenderJob) -> Vec<PathBuf> {
+    let name = || job.metadata.name.clone().unwrap_or_else(|| source::name(&job.spec.scene.source));
+    let output = job.spec.image.output.as_ref().map_or_else(|| PathBuf::from(format!("{}.exr", name())), PathBuf::from);
+    let cameras = &job.spec.image.cameras;
+    if cameras.len() < 2 {
+        return vec![output];
+    }
+    let stem = output.file_stem().unwrap_or_default().to_string_lossy().into_owned();
+    let numbered = |(i, c): (usize, &CameraSpec)| {
+        let mark = c.name.clone().unwrap_or_else(|| format!("{:04}", i + 1));
+        output.with_file_name(format!("{stem}-{mark}.exr"))
+    };
+    cameras.iter().enumerate().map(numbered).collect()
+}
+
+/// Samples per pixel: the job's, the scene's, or the default.
+pub fn samples(job: &RenderJob, manifest: &Manifest) -> u32 {
+    job.spec.sampling.spp.map(|n| n as u32).or(manifest.defaults.spp).unwrap_or(DEFAULT_SPP)
+}
+
+/// The frame that a camera sees; the scene's own without one.
+pub fn frame(job: &RenderJob, manifest: &Manifest, camera: Option<&CameraSpec>) -> anyhow::Result<Frame> {
+    let (image, sampling, defaults) = (&job.spec.image, &job.spec.sampling, &manifest.defaults);
+    let camera = match camera {
+        Some(c) => {
+            let view = CameraView { origin: c.origin, target: c.target, up: c.up, fov: c.fov };
+            view.camera().map_err(|e| Mistake(e.to_string()))?
+        }
+        None => {
+            defaults.camera.clone().ok_or_else(|| Mistake("the scene has no camera: give one by --camera".into()))?
+        }
+    };
+    let size = image.size.map(|s| [s.width(), s.height()]).or(defaults.size).unwrap_or(DEFAULT_SIZE);
+    let camera = Camera::new(&camera.to_world.0, camera.fov_x, size, manifest.offset)
+        .map_err(|e| Mistake(format!("camera: {e}")))?;
+    let given = |v: Option<i32>| v.map(|n| n as u32);
+    let frame = Frame {
+        camera,
+        size,
+        filter: defaults.filter.unwrap_or(Filter::Box),
+        seed: sampling.seed.map_or(0, |n| n as u64),
+        max_depth: given(sampling.max_depth).or(defaults.max_depth).unwrap_or(DEFAULT_MAX_DEPTH),
+        rr_depth: given(sampling.rr_depth).or(defaults.rr_depth).unwrap_or(DEFAULT_RR_DEPTH),
+        split: given(sampling.split).unwrap_or(1),
+    };
+    frame.check().map_err(|e| Mistake(e.to_string()))?;
+    check_memory(size)?;
+    Ok(frame)
+}
+
+/// What defines an image, for the header of its file: the scene's content, the frame, the number of samples.
+pub fn definition(manifest: &Manifest, frame: &Frame, spp: u32) -> anyhow::Result<Map<String, Value>> {
+    let frame = serde_json::to_value(frame).context("cannot write the frame down")?;
+    let value = json!({ "scene": manifest.content, "frame": frame, "spp": spp });
+    match value {
+        Value::Object(map) => Ok(map),
+        _ => anyhow::bail!("the definition of an image is an object"),
+    }
+}
+
+/// Bytes per pixel: the film's two halves of three 16-byte sums, once for the whole and once in tasks, and the picture.
+const BYTES_PER_PIXEL: u64 = 2 * 96 + 12;
+
+fn check_memory([width, height]: [u32; 2]) -> Result<(), Mistake> {
+    let needed = u64::from(width) * u64::from(height) * BYTES_PER_PIXEL;
+    let Some(have) = memory_of_machine() else { return Ok(()) };
+    if needed > have {
+        let gib = |bytes: u64| bytes as f64 / f64::from(1 << 30);
+        let message = "give a smaller --size, or render it in parts with several cameras";
+        return Err(Mistake(format!(
+            "an image of {width}x{height} pixels takes {:.1} GiB, this machine has {:.1}: {message}",
+            gib(needed),
+            gib(have)
+        )));
+    }
+    Ok(())
+}
+
+/// Bytes of memory, where the system tells.
+fn memory_of_machine() -> Option<u64> {
+    let text = std::fs::read_to_string(Path::new("/proc/meminfo")).ok()?;
+    let line = text.lines().find(|l| l.starts_with("MemTotal:"))?;
+    line.split_whitespace().nth(1)?.parse::<u64>().ok().map(|kib| kib * 1024)
+}
+
+#[cfg(test)]
+mod tests {
+    use rayherd_api::RenderJobSpec;
+
+    use super::*;
+
+    fn camera(name: Option<&str>) -> CameraSpec {
+        CameraSpec {
+            name: name.map(str::to_owned),
+            origin: [0.0, 0.0, 4.0],
+            target: [0.0; 3],
+            up: [0.0, 1.0, 0.0],
+            fov: 40.0,
+        }
+    }
+
+    #[test]
+    fn every_camera_has_its_file() {
+        let mut spec = RenderJobSpec::default();
+        spec.scene.source = "scenes/room.xml".into();
+        let mut job = RenderJob::new(spec);
+        assert_eq!(files(&job), [PathBuf::from("room.exr")]);
+        job.metadata.name = Some("night".into());
+        assert_eq!(files(&job), [PathBuf::from("night.exr")]);
+        job.spec.image.output = Some("out/x.exr".into());
+        job.spec.image.cameras = vec![camera(Some("front"))];
+        assert_eq!(files(&job), [PathBuf::from("out/x.exr")]);
+        job.spec.image.cameras.push(camera(None));
+        assert_eq!(files(&job), [PathBuf::from("out/x-front.exr"), PathBuf::from("out/x-0002.exr")]);
+    }
+
+    #[test]
+    fn an_image_that_does_not_fit_is_refused() {
+        if memory_of_machine().is_none_or(|have| have > 800 << 30) {
+            eprintln!("this system does not say how much memory it has, or has a lot");
+            return;
+        }
+        assert!(check_memory([65535, 65535]).unwrap_err().to_string().contains("GiB"));
+        assert!(check_memory([64, 64]).is_ok());
+    }
+}

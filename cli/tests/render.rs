@@ -1,0 +1,172 @@
+//! `rayherd render` from outside.
+
+mod common;
+
+use std::fs;
+use std::path::Path;
+
+use common::{Run, assert_mistake, rayherd, repository};
+use serde_json::Value;
+
+fn cornell(folder: &Path, output: &str, more: &[&str]) -> Run {
+    let scene = repository("examples/cornell-box.xml");
+    let mut arguments = vec!["render", scene.to_str().unwrap(), "--size", "16x16", "--spp", "4", "-o", output];
+    arguments.extend(more);
+    rayherd(folder, &arguments)
+}
+
+fn files(folder: &Path) -> Vec<String> {
+    let mut names: Vec<String> =
+        fs::read_dir(folder).unwrap().map(|e| e.unwrap().file_name().into_string().unwrap()).collect();
+    names.sort();
+    names
+}
+
+#[test]
+fn the_files_are_the_same_however_it_runs() {
+    let folder = tempfile::tempdir().unwrap();
+    let run = |name: &str, more: &[&str]| {
+        let run = cornell(folder.path(), name, more);
+        assert_eq!(run.code, 0, "{more:?}: {}", run.err);
+        fs::read(folder.path().join(name)).unwrap()
+    };
+    let first = run("a.exr", &["--threads", "1", "--report", "r.json"]);
+    for more in [
+        &["--threads", "2"][..],
+        &["--kernel", "scalar", "--threads", "1"],
+        &["--splits", "5", "--strategy", "demand-driven", "--nodes", "2", "--slots", "1", "--replicas", "2"],
+        &["--splits", "3", "--strategy", "scheduling-grid", "--slots", "1,2", "--barrier", "off"],
+        &["--block-size", "1Ki", "--strategy", "scheduling-grid-overlap-reduced", "--memory", "4KiB"],
+        &["--splits", "4", "--nodes", "3", "--memory", "2Ki", "--task-seconds", "0.01"],
+    ] {
+        assert!(run("b.exr", more) == first, "{more:?}");
+    }
+    // another image is another file: the header says which
+    assert!(run("c.exr", &["--seed", "1"]) != first);
+    let equal = rayherd(folder.path(), &["compare", "a.exr", "b.exr"]);
+    assert_eq!(equal.code, 0, "{}", equal.out);
+    let other = rayherd(folder.path(), &["compare", "a.exr", "c.exr"]);
+    assert_eq!(other.code, 1, "{}", other.out);
+    // nothing but pictures and report is left
+    assert_eq!(files(folder.path()), ["a.exr", "a.png", "b.exr", "b.png", "c.exr", "c.png", "r.json"]);
+
+    let report: Value = serde_json::from_slice(&fs::read(folder.path().join("r.json")).unwrap()).unwrap();
+    for key in [
+        "strategy",
+        "nodes",
+        "slots",
+        "rounds",
+        "tasks",
+        "tasks_redone",
+        "tasks_reused",
+        "attempts_lost",
+        "wall_s",
+        "cpu_s",
+        "samples",
+        "rays",
+        "bytes",
+        "scene_bytes",
+        "scene_passes",
+        "remote_ratio",
+        "remote_ratio_all",
+        "network_bytes",
+        "hops",
+        "bytes_per_hop",
+        "peak_memory_bytes",
+        "non_finite",
+        "rel_mse",
+        "prepare",
+        "nodes_detail",
+        "skipped",
+    ] {
+        assert!(report.get(key).is_some(), "no {key} in {report}");
+    }
+    assert_eq!(report["samples"], 16 * 16 * 4);
+    assert_eq!(report["prepare"]["counts"]["triangles"], 36);
+}
+
+#[test]
+fn the_summary_says_where_and_how_noisy() {
+    let folder = tempfile::tempdir().unwrap();
+    let run = cornell(folder.path(), "x.exr", &["--target-error", "1e-9"]);
+    assert_eq!(run.code, 0, "{}", run.err);
+    let parts = ["x.exr and x.png: 16x16, 4 spp, relMSE ", "(target 0.000000001 not reached", "CPU-seconds"];
+    assert!(parts.iter().all(|p| run.out.contains(p)), "{}", run.out);
+    let run = cornell(folder.path(), "x.exr", &["--target-error", "1e9"]);
+    assert!(run.out.contains("reached)"), "{}", run.out);
+}
+
+#[test]
+fn a_job_file_renders_a_frame_for_each_camera() {
+    let folder = tempfile::tempdir().unwrap();
+    fs::copy(repository("examples/cornell-box.xml"), folder.path().join("box.xml")).unwrap();
+    fs::create_dir(folder.path().join("jobs")).unwrap();
+    let job = "
+apiVersion: rayherd.io/v1alpha1
+kind: RenderJob
+metadata: {name: two}
+spec:
+  scene: {source: ../box.xml}
+  image:
+    size: 16x8
+    cameras:
+    - {name: front, origin: [0, 1, 6.8], target: [0, 1, 0], fov: 20}
+    - {origin: [0, 1, 6.8], target: [0, 0.5, 0], fov: 30}
+  sampling: {spp: 2, maxDepth: 3}
+  strategy: SchedulingGridOverlapReduced
+  splits: 3
+  workers: {slots: [1, 1], memory: 8Ki}
+  replicas: 2
+";
+    fs::write(folder.path().join("jobs/two.yaml"), job).unwrap();
+    let run = rayherd(folder.path(), &["render", "-f", "jobs/two.yaml", "--report", "r.json"]);
+    assert_eq!(run.code, 0, "{}", run.err);
+    assert_eq!(run.out.lines().count(), 2, "{}", run.out);
+    let report: Value = serde_json::from_slice(&fs::read(folder.path().join("r.json")).unwrap()).unwrap();
+    assert_eq!(report.as_array().map(Vec::len), Some(2));
+    assert_eq!(report[0]["strategy"], "scheduling-grid-overlap-reduced");
+    assert_eq!(report[1]["nodes"], 2);
+    // the same cameras by flags, over the file
+    let flags = ["render", "-f", "jobs/two.yaml", "--camera", "0,1,6.8,0,1,0,0,1,0,20", "-o", "flags.exr"];
+    assert_eq!(rayherd(folder.path(), &flags).code, 0);
+    let same = rayherd(folder.path(), &["compare", "two-front.exr", "flags.exr"]);
+    assert!(same.out.contains("\"file_identical\": true"), "{}", same.out);
+    let other = rayherd(folder.path(), &["compare", "two-front.exr", "two-0002.exr"]);
+    assert_eq!(other.code, 1, "{}", other.err);
+
+    fs::write(folder.path().join("bad.yaml"), job.replace("maxDepth", "maxdepth")).unwrap();
+    assert_mistake(
+        &rayherd(folder.path(), &["render", "-f", "bad.yaml"]),
+        &["bad.yaml", "unknown field `maxdepth`", "`maxDepth`", "line"],
+    );
+    fs::write(folder.path().join("bad.yaml"), job.replace("replicas: 2", "replicas: 3").replace("fov: 20", "fov: 0"))
+        .unwrap();
+    assert_mistake(
+        &rayherd(folder.path(), &["render", "-f", "bad.yaml"]),
+        &["bad.yaml: spec.image.cameras[0].fov", "bad.yaml: spec.replicas: is 3, but there are 2 nodes"],
+    );
+}
+
+#[test]
+fn mistakes_are_found_before_anything_is_rendered() {
+    let folder = tempfile::tempdir().unwrap();
+    let cornell = |output: &str, more: &[&str]| cornell(folder.path(), output, more);
+    assert_mistake(&cornell("none/x.exr", &[]), &["cannot write none/x.exr", "-o"]);
+    assert_mistake(&cornell("x.jpg", &[]), &["--output", ".exr"]);
+    assert_mistake(&cornell("x.exr", &["--report", "none/r.json"]), &["cannot write none/r.json"]);
+    assert_mistake(&cornell("x.exr", &["--memory", "100"]), &["100 bytes", "largest split takes"]);
+    assert_mistake(&cornell("x.exr", &["--replicas", "2"]), &["--replicas is 2, but there are 1 nodes"]);
+    assert_mistake(&cornell("x.exr", &["--nodes", "3", "--slots", "1,2"]), &["--slots has 2 numbers for 3 nodes"]);
+    assert_mistake(&cornell("x.exr", &["--split", "0"]), &["--split is 0"]);
+    assert_mistake(&cornell("x.exr", &["--strategy", "magic"]), &["--strategy", "demand-driven"]);
+    assert_mistake(&cornell("x.exr", &["--kernel", "neon"]), &["--kernel", "avx2"]);
+    assert_mistake(&cornell("x.exr", &["--camera", "0,0,0,0,0,0,0,1,0,40"]), &["--camera", "one point"]);
+    assert_mistake(&cornell("x.exr", &["-D", "nothing=1"]), &["nothing"]);
+    assert_mistake(&cornell("x.exr", &["--iso", "-300"]), &["iso"]);
+    assert_mistake(&rayherd(folder.path(), &["render"]), &["SCENE"]);
+    assert_mistake(&rayherd(folder.path(), &["render", "-f", "none.yaml"]), &["cannot read none.yaml"]);
+    let scene = repository("examples/cornell-box.xml");
+    let huge = ["render", scene.to_str().unwrap(), "--size", "65535x65535"];
+    assert_mistake(&rayherd(folder.path(), &huge), &["65535x65535", "GiB", "--size"]);
+    assert_eq!(files(folder.path()), [""; 0]);
+}
