@@ -84,7 +84,8 @@ struct Store<'a> {
 impl GroupSink for Store<'_> {
     fn store(&self, to: Destination, number: u32, rays: &Flights) -> Result<GroupRef, JobError> {
         let key = format!("rays/{}-{number}", self.attempt.name);
-        let body = codec::encode_rays(self.shared.frame, rays);
+        let body = codec::encode_rays(self.shared.frame, rays)
+            .map_err(|source| JobError::Wire { key: key.clone(), source })?;
         let bytes = body.len() as u64;
         let holders = self.shared.nodes.put(self.attempt.node, Kind::Rays, &key, body)?;
         Ok(GroupRef { key, to, rays: rays.len() as u32, bytes, holders })
