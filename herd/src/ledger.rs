@@ -81,9 +81,11 @@ pub struct TaskId(pub u64);
 /// One commit. Its name is the hash of its bytes.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Record {
+    /// What defines the image: the same in all records of a chain.
+    pub image: String,
     /// Place in the chain, from 0.
     pub sequence: u64,
-    /// Name of the record before; for the first one, what defines the image.
+    /// Name of the record before; for the first one, the image's.
     pub parent: String,
     /// What it took.
     pub took: Inputs,
@@ -143,6 +145,7 @@ struct Running {
 /// The state machine.
 #[derive(Clone, Debug)]
 pub struct Ledger {
+    image: String,
     head: String,
     sequence: u64,
     waiting: BTreeMap<String, GroupRef>,
@@ -161,6 +164,7 @@ impl Ledger {
     /// An empty ledger for an image, named by what defines it, of so many tiles.
     pub fn new(image: &str, tiles: u32) -> Self {
         Ledger {
+            image: image.to_owned(),
             head: image.to_owned(),
             sequence: 0,
             waiting: BTreeMap::new(),
@@ -266,26 +270,54 @@ impl Ledger {
     pub fn record(&self, id: TaskId, made: Outputs) -> Result<Record, Refused> {
         let task = self.running.get(&id).ok_or(Refused::NotRunning(id))?;
         let took = Inputs { groups: task.inputs.iter().map(|g| g.key.clone()).collect(), camera: task.camera.clone() };
-        Ok(Record { sequence: self.sequence, parent: self.head.clone(), took, made, snapshot: None })
+        Ok(self.next_record(took, made, None))
     }
 
-    /// The state that a snapshot in `record` must hold, with the film of all commits up to it.
-    pub fn snapshot_after(&self, record: &Record, film: Option<FilmRef>) -> Snapshot {
-        let mut done = self.done.clone();
-        let mut rays = self.rays;
-        record.took.camera.iter().for_each(|&u| {
-            done.add(u);
-        });
-        rays.merge(&record.made.rays);
-        // what running tasks hold is not consumed yet: it waits, for whoever resumes
+    /// A record that changes nothing but holds the whole state, or takes the ledger back to an earlier one.
+    pub fn record_of(&self, snapshot: Snapshot) -> Record {
+        self.next_record(Inputs::default(), Outputs::default(), Some(snapshot))
+    }
+
+    fn next_record(&self, took: Inputs, made: Outputs, snapshot: Option<Snapshot>) -> Record {
+        let (image, parent) = (self.image.clone(), self.head.clone());
+        Record { image, sequence: self.sequence, parent, took, made, snapshot }
+    }
+
+    /// The state as it is, with the film of all commits; what running tasks hold waits in it.
+    pub fn snapshot(&self, film: Option<FilmRef>) -> Snapshot {
         let held = self.running.values().flat_map(|t| &t.inputs);
-        let gone: BTreeSet<&String> = record.took.groups.iter().collect();
-        let mut waiting: Vec<GroupRef> =
-            self.waiting.values().chain(held).filter(|g| !gone.contains(&g.key)).cloned().collect();
-        waiting.extend(record.made.groups.iter().cloned());
+        let mut waiting: Vec<GroupRef> = self.waiting.values().chain(held).cloned().collect();
         waiting.sort_by(|a, b| a.key.cmp(&b.key));
-        let non_finite = self.non_finite + record.made.non_finite;
-        Snapshot { film, waiting, done, commits: self.commits + 1, rays, non_finite }
+        let (commits, rays, non_finite) = (self.commits, self.rays, self.non_finite);
+        Snapshot { film, waiting, done: self.done.clone(), commits, rays, non_finite }
+    }
+
+    /// Gives up all running tasks and takes the state of a snapshot, whose record is durable.
+    pub fn go_back(&mut self, record: &Record, name: String) -> Result<(), Refused> {
+        if record.parent != self.head || record.sequence != self.sequence {
+            return Err(bad(record, "its parent is not the newest record"));
+        }
+        let given_up: usize = self.running.values().map(|t| t.live.len()).sum();
+        self.attempts_lost += given_up as u64;
+        self.running.clear();
+        self.replay(record, name)
+    }
+
+    /// A group lies elsewhere now. Whether it waits, or a running task has it.
+    pub fn relocate(&mut self, key: &str, holders: Vec<u32>) -> bool {
+        let held = self.running.values_mut().flat_map(|t| &mut t.inputs).find(|g| g.key == key);
+        match self.waiting.get_mut(key).or(held) {
+            Some(group) => {
+                group.holders = holders;
+                true
+            }
+            None => false,
+        }
+    }
+
+    /// Whether no ray is on its way: nothing waits, and running tasks only make camera rays.
+    pub fn is_settled(&self) -> bool {
+        self.waiting.is_empty() && self.running.values().all(|t| t.inputs.is_empty())
     }
 
     /// Commits a running task by its (durable) record; `name` is the record's hash. Other attempts become garbage.
@@ -303,8 +335,20 @@ impl Ledger {
         Ok(())
     }
 
+    /// Appends a record that holds the state as it is; running tasks go on.
+    pub fn follow_snapshot(&mut self, record: &Record, name: String) -> Result<(), Refused> {
+        if record.parent != self.head || record.sequence != self.sequence {
+            return Err(bad(record, "its parent is not the newest record"));
+        }
+        (self.head, self.sequence) = (name, record.sequence + 1);
+        Ok(())
+    }
+
     /// Applies the next record of a chain that is replayed. No task may run.
     pub fn replay(&mut self, record: &Record, name: String) -> Result<(), Refused> {
+        if record.image != self.image {
+            return Err(bad(record, "it is of another image"));
+        }
         if let Some(s) = &record.snapshot {
             // a snapshot stands for all records up to its own
             self.waiting = s.waiting.iter().map(|g| (g.key.clone(), g.clone())).collect();

@@ -8,4 +8,4 @@ mod settings;
 pub use error::JobError;
 pub use progress::{Image, Progress, Silent, Status};
 pub use scene::PreparedScene;
-pub use settings::{JobSettings, NodeSpec, Sampling};
+pub use settings::{Commits, JobSettings, NodeSpec, Sampling};

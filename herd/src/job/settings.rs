@@ -1,15 +1,37 @@
 //! How a job is to be run, and which image it is to make.
 
+use std::fmt;
 use std::num::NonZeroU32;
+use std::sync::Arc;
 
 use rayherd_api::Strategy;
 use rayherd_render::bvh::Kernel;
+
+use crate::store::BlockStore;
 
 /// One node.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct NodeSpec {
     /// Tasks that it runs at once.
     pub slots: u32,
+}
+
+/// Where a job keeps its commits, so that it can go on after a crash, or with more samples.
+#[derive(Clone)]
+pub struct Commits {
+    /// The store; one job's.
+    pub store: Arc<dyn BlockStore>,
+    /// Goes on where the store's records end; without it a store with records is refused.
+    pub resume: bool,
+    /// Takes the store from whoever writes to it.
+    pub takeover: bool,
+}
+
+impl fmt::Debug for Commits {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Commits { store, resume, takeover } = self;
+        write!(f, "Commits {{ {}, resume: {resume}, takeover: {takeover} }}", store.describe())
+    }
 }
 
 /// How a job runs. None of it touches a byte of the image.
@@ -35,6 +57,10 @@ pub struct JobSettings {
     pub batch: u32,
     /// Bytes of rays that a task holds before it puts some of them into a group.
     pub ray_buffer: u64,
+    /// A task that runs longer than this, and three times its size, gets a second attempt when slots are idle.
+    pub straggler_seconds: f64,
+    /// Where commits are kept; nowhere if none.
+    pub commits: Option<Commits>,
     /// Seed of a schedule of faults to inject, for tests.
     pub faults: Option<u64>,
 }
@@ -54,6 +80,8 @@ impl Default for JobSettings {
             kernel: Kernel::Auto,
             batch: 16_384,
             ray_buffer: 64 << 20,
+            straggler_seconds: 1.0,
+            commits: None,
             faults: None,
         }
     }

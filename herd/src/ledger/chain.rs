@@ -52,8 +52,8 @@ pub fn newest(image: &str, records: BTreeMap<String, Record>) -> Result<Chain, C
     for (name, record) in &records {
         children.entry(&record.parent).or_default().push(name);
     }
-    if let Some(other) = records.values().find(|r| r.sequence == 0 && r.parent != image) {
-        return Err(ChainError::OtherImage { found: other.parent.clone(), wanted: image.to_owned() });
+    if let Some(other) = records.values().find(|r| r.image != image) {
+        return Err(ChainError::OtherImage { found: other.image.clone(), wanted: image.to_owned() });
     }
     let mut tips: Vec<&String> = records.keys().collect();
     tips.sort_by_key(|name| (std::cmp::Reverse(records[*name].sequence), *name));

@@ -58,6 +58,7 @@ fn inputs_of_a_lost_task_wait_again() {
 #[test]
 fn the_newest_complete_chain_wins_and_forks_are_named() {
     let record = |sequence, parent: &str| Record {
+        image: "image".into(),
         sequence,
         parent: parent.into(),
         took: Inputs::default(),
@@ -141,14 +142,16 @@ proptest! {
                     keys += n;
                     match ledger.record(id, Outputs { groups, ..Outputs::default() }) {
                         Ok(record) => {
-                            let mut record = record;
-                            if record.sequence % 3 == 2 {
-                                record.snapshot = Some(ledger.snapshot_after(&record, None));
-                            }
                             let name = format!("r{}", record.sequence);
                             ledger.commit(id, &record, name.clone()).unwrap();
                             records.push((name, record));
                             prop_assert!(finished.insert(id));
+                            if ledger.sequence % 4 == 3 {
+                                let record = ledger.record_of(ledger.snapshot(None));
+                                let name = format!("r{}", record.sequence);
+                                ledger.follow_snapshot(&record, name.clone()).unwrap();
+                                records.push((name, record));
+                            }
                         }
                         Err(e) => prop_assert_eq!((e, finished.contains(&id)), (Refused::NotRunning(id), true)),
                     }
@@ -187,4 +190,21 @@ proptest! {
             prop_assert_eq!((again.sequence, again.commits), (ledger.sequence, ledger.commits));
         }
     }
+}
+
+#[test]
+fn going_back_gives_up_what_came_after() {
+    let mut ledger = Ledger::new("image", 1);
+    let (id, _) = ledger.start(&camera(&[unit(0, 0, 1)])).unwrap();
+    let before = ledger.snapshot(None);
+    assert!(ledger.is_settled());
+    commit(&mut ledger, id, Outputs { groups: vec![group("a", 0, 5)], ..Outputs::default() });
+    assert!(!ledger.is_settled() && ledger.relocate("a", vec![3]) && !ledger.relocate("b", vec![]));
+    let (running, groups) = ledger.start(&Inputs { groups: vec!["a".into()], camera: vec![] }).unwrap();
+    assert_eq!(groups[0].holders, [3]);
+    let record = ledger.record_of(before);
+    ledger.go_back(&record, "back".into()).unwrap();
+    assert!(ledger.is_quiet() && !ledger.lost(running, 0));
+    assert_eq!((ledger.commits(), ledger.attempts_lost(), ledger.done().complete()), (0, 1, 0));
+    assert!(ledger.start(&camera(&[unit(0, 0, 1)])).is_ok(), "its camera rays are free again");
 }

@@ -19,6 +19,7 @@ use crate::task::codec;
 use crate::task::groups::{GroupSink, Groups};
 use crate::task::{CameraFeed, Loop, Outbox, Stop};
 use crate::wave::CameraUnit;
+use crate::wire::ray_group;
 
 /// What an attempt works on.
 #[derive(Clone, Debug)]
@@ -84,8 +85,8 @@ struct Store<'a> {
 impl GroupSink for Store<'_> {
     fn store(&self, to: Destination, number: u32, rays: &Flights) -> Result<GroupRef, JobError> {
         let key = format!("rays/{}-{number}", self.attempt.name);
-        let body = codec::encode_rays(self.shared.frame, rays)
-            .map_err(|source| JobError::Wire { key: key.clone(), source })?;
+        let wrong = |source| JobError::Wire { key: key.clone(), source };
+        let body = ray_group::encode(self.shared.frame, rays).map_err(wrong)?;
         let bytes = body.len() as u64;
         let holders = self.shared.nodes.put(self.attempt.node, Kind::Rays, &key, body)?;
         Ok(GroupRef { key, to, rays: rays.len() as u32, bytes, holders })
@@ -137,7 +138,11 @@ impl Task<'_, '_> {
         let least = 4 * self.shared.settings.batch as usize;
         let mut flights = Flights::default();
         for group in &self.attempt.groups {
-            let open = |body: &bytes::Bytes| codec::decode_rays(self.shared.frame, body);
+            let open = |body: &bytes::Bytes| {
+                let rays = ray_group::decode(self.shared.frame, body)?;
+                codec::check_rays(self.shared.scene, &rays)?;
+                Ok(rays)
+            };
             let mut rays = self.shared.nodes.get(self.attempt.node, Kind::Rays, &group.key, &group.holders, open)?;
             flights.append(&mut rays);
             if flights.len() >= least {

@@ -27,6 +27,10 @@ impl Cameras {
         let pixels = (0..starts.len() as u32).map(|t| u64::from(tile_pixels(frame, t))).collect();
         Cameras { starts, pixels, queues: BTreeMap::new(), added: 0 }
     }
+    /// Forgets all units.
+    pub fn clear(&mut self) {
+        self.queues.clear();
+    }
     /// Adds what of the samples was not taken.
     pub fn add(&mut self, samples: Range<u32>, taken: &Done) {
         for first in samples.clone().step_by(UNIT_SAMPLES as usize) {
@@ -36,6 +40,13 @@ impl Cameras {
                     self.push_back(unit);
                 }
             }
+        }
+    }
+    /// Puts units of a task that was given up first in their queues.
+    pub fn give_back(&mut self, units: &[CameraUnit]) {
+        for &unit in units.iter().rev() {
+            let queue = self.queues.entry(self.starts[unit.tile as usize]).or_default();
+            queue.push_front((0, unit));
         }
     }
     /// Camera rays by start split.

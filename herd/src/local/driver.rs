@@ -12,14 +12,17 @@ use rayherd_render::frame::Frame;
 
 use super::attempt::{Attempt, Made, Shared, run};
 use super::cameras::Cameras;
+use super::faults::{Fate, Faults};
+use super::journal;
 use super::nodes::Nodes;
+use super::owner::Ownership;
 use super::slots::{Gate, StopFlag};
 use super::{JobOutcome, check, usage};
 use crate::job::{Image, JobError, JobSettings, NodeSpec, PreparedScene, Progress, Sampling, Status};
-use crate::ledger::{Destination, GroupRef, Inputs, Ledger, TaskId};
+use crate::ledger::{Destination, GroupRef, Inputs, Ledger, Outputs, Record, Refused, Snapshot, TaskId};
 use crate::plan::rate::Rate;
 use crate::plan::{self, Assignment, NodeView, Set, SplitView, View, Waiting, place};
-use crate::report::Report;
+use crate::report::{Kind, Report};
 use crate::store::MemoryStore;
 use crate::task::camera::tiles;
 use crate::wave;
@@ -35,22 +38,95 @@ pub(super) fn render(
     progress: &dyn Progress,
 ) -> Result<JobOutcome, JobError> {
     check(scene, frame, sampling, settings)?;
-    let nodes = Nodes::new(scene, settings, Arc::new(MemoryStore::default()))?;
-    let store_film = settings.nodes.len() > 1;
-    let shared = Shared { scene, frame, settings, nodes, store_film, buckets: settings.slots() };
+    let store = settings.commits.as_ref().map_or_else(|| Arc::new(MemoryStore::default()) as _, |c| c.store.clone());
+    let nodes = Nodes::new(scene, settings, store)?;
+    let durable = settings.commits.is_some();
+    let shared = Shared {
+        scene,
+        frame,
+        settings,
+        nodes,
+        store_film: durable || settings.nodes.len() > 1,
+        buckets: settings.slots(),
+    };
+    let image = image_name(scene, frame)?;
+    let start = begin(&shared, &image, sampling)?;
     let threads = settings
         .threads
         .map_or_else(|| std::thread::available_parallelism().map_or(1, |n| n.get()), |n| n.get() as usize);
     let gate = Gate::new(threads);
-    let ledger = Ledger::new("image", tiles(frame));
     let (send, receive) = channel();
-    let mut driver = Driver::new(&shared, &gate, ledger, sampling, progress, send);
-    std::thread::scope(|scope| {
+    let mut driver = Driver::new(&shared, &gate, start, sampling, progress, send);
+    let result = std::thread::scope(|scope| {
         let result = driver.run(scope, &receive);
         driver.stop_all();
         result
-    })?;
-    driver.finish()
+    });
+    match result {
+        Ok(()) => driver.finish(),
+        Err(e) => {
+            give_back(&shared.nodes, driver.owner.as_ref());
+            Err(e)
+        }
+    }
+}
+
+/// Takes the store, if the job keeps commits, and reads the state to go on from.
+fn begin(shared: &Shared, image: &str, sampling: &Sampling) -> Result<Start, JobError> {
+    let (nodes, size, tiles) = (&shared.nodes, shared.frame.size, tiles(shared.frame));
+    let Some(commits) = &shared.settings.commits else {
+        let (ledger, film) = (Ledger::new(image, tiles), FilmPart::new(size));
+        return Ok(Start { ledger, film, owner: None, reused: 0, redone: 0 });
+    };
+    let owner = nodes.wait(Ownership::take(nodes.store().as_ref(), commits.takeover))?;
+    let resume = || {
+        let place = nodes.store().describe();
+        let refuse = |message: String| Err(JobError::Settings(message));
+        if !commits.resume && !nodes.wait(nodes.store().list("records/"))?.is_empty() {
+            return refuse(format!("{place} holds a job already: resume it, or use another store"));
+        }
+        let resumed = journal::resume(nodes, image, tiles, size)?;
+        let (reach, spp) = (resumed.ledger.done().reach(), sampling.spp);
+        if reach > spp {
+            return refuse(format!(
+                "{place} holds {reach} samples per pixel, {spp} were asked for: ask for at least as many"
+            ));
+        }
+        Ok(resumed)
+    };
+    match resume() {
+        Ok(r) => Ok(Start { ledger: r.ledger, film: r.film, owner: Some(owner), reused: r.reused, redone: r.lost }),
+        Err(e) => {
+            give_back(nodes, Some(&owner));
+            Err(e)
+        }
+    }
+}
+
+/// Gives the store back after an error, which is the one to report: if this fails too, the next run finds a dead owner.
+fn give_back(nodes: &Nodes, owner: Option<&Ownership>) {
+    if let Some(owner) = owner
+        && let Err(e) = nodes.wait(owner.give_back(nodes.store().as_ref()))
+    {
+        tracing::warn!("{e}");
+    }
+}
+
+/// Names what defines the image: the scene's content and the frame.
+fn image_name(scene: &PreparedScene, frame: &Frame) -> Result<String, JobError> {
+    let frame = serde_json::to_vec(frame).map_err(|e| JobError::Internal(e.to_string()))?;
+    let mut hasher = blake3::Hasher::new();
+    hasher.update(b"rayherd image 1\0").update(&scene.manifest.content.0).update(&frame);
+    Ok(hasher.finalize().to_hex().to_string())
+}
+
+/// Where a job begins: at nothing, or where an earlier run stopped.
+struct Start {
+    ledger: Ledger,
+    film: FilmPart,
+    owner: Option<Ownership>,
+    reused: u64,
+    redone: u64,
 }
 
 /// What a thread reports.
@@ -63,15 +139,24 @@ struct Message {
 
 /// A task that runs.
 struct Running {
-    attempts: BTreeMap<u32, Live>,
     spec: Attempt,
+    started: Instant,
+    attempts: u32,
 }
 
-/// An attempt that runs.
+/// An attempt that runs, of a task that may be committed already.
 struct Live {
     node: u32,
     stop: StopFlag,
+    /// Its place among all attempts of the job.
+    ordinal: u64,
 }
+
+/// Objects by name, with the nodes that hold them.
+type Objects = Vec<(String, Vec<u32>)>;
+
+/// Commits between two snapshots.
+const SNAPSHOT_EVERY: u64 = 16;
 
 struct Driver<'s, 'a> {
     shared: &'s Shared<'a>,
@@ -90,10 +175,25 @@ struct Driver<'s, 'a> {
     windows: Vec<BTreeSet<u32>>,
     free: Vec<u32>,
     running: BTreeMap<TaskId, Running>,
+    live: BTreeMap<(TaskId, u32), Live>,
+    committed: BTreeSet<(TaskId, u32)>,
+    launched: u64,
+    faults: Option<Faults>,
+    owner: Option<Ownership>,
+    /// Names of this run's objects begin with it.
+    session: String,
+    /// State to go back to when rays are lost: the last one without rays on their way.
+    settled: (Snapshot, FilmPart),
+    /// Objects that the last snapshot made superfluous, and those that the next one will.
+    superfluous: [Objects; 2],
+    old_records: [Vec<String>; 2],
     rate: Rate,
     start: Instant,
+    begun: bool,
     rounds: u64,
     tasks: u64,
+    reused: u64,
+    redone: u64,
     hops: u64,
     hop_bytes: u64,
     error: Option<f64>,
@@ -103,7 +203,7 @@ impl<'s, 'a> Driver<'s, 'a> {
     fn new(
         shared: &'s Shared<'a>,
         gate: &'s Gate,
-        ledger: Ledger,
+        begin: Start,
         sampling: &'s Sampling,
         progress: &'s dyn Progress,
         send: Sender<Message>,
@@ -116,20 +216,32 @@ impl<'s, 'a> Driver<'s, 'a> {
         Driver {
             shared,
             gate,
-            ledger,
-            film: FilmPart::new(shared.frame.size),
+            queued: begin.ledger.done().complete(),
+            settled: (Ledger::new("", tiles(shared.frame)).snapshot(None), FilmPart::new(shared.frame.size)),
+            session: begin.owner.as_ref().map_or_else(|| "job".to_owned(), |o| o.session().to_owned()),
+            ledger: begin.ledger,
+            film: begin.film,
+            owner: begin.owner,
+            reused: begin.reused,
+            redone: begin.redone,
+            faults: shared.settings.faults.map(Faults::new),
             cameras: Cameras::new(shared.frame, starts),
             sampling,
             progress,
             send,
-            queued: 0,
             order,
             rank,
             windows: vec![BTreeSet::new(); shared.settings.nodes.len()],
             free: shared.settings.nodes.iter().map(|n| n.slots).collect(),
             running: BTreeMap::new(),
+            live: BTreeMap::new(),
+            committed: BTreeSet::new(),
+            launched: 0,
+            superfluous: Default::default(),
+            old_records: Default::default(),
             rate: Rate::UNKNOWN,
             start: Instant::now(),
+            begun: false,
             rounds: 0,
             tasks: 0,
             hops: 0,
@@ -145,27 +257,34 @@ impl<'s, 'a> Driver<'s, 'a> {
     {
         let barrier = self.shared.settings.has_barrier();
         loop {
+            if self.queued > 0 && self.is_step_over() && self.step_done() {
+                return Ok(());
+            }
             self.queue_steps();
+            let mut started = false;
             if !barrier || self.running.is_empty() {
-                let mut started = false;
                 for task in self.plan() {
                     started |= self.start(scope, task)?;
                 }
                 self.rounds += u64::from(started && barrier);
             }
-            if self.running.is_empty() {
-                if !self.ledger.is_quiet() || !self.cameras.is_empty() {
-                    return Err(JobError::Internal("rays wait, but nothing was planned".into()));
+            if self.live.is_empty() {
+                if self.is_step_over() {
+                    continue;
                 }
-                if self.step_done() {
-                    return Ok(());
-                }
-                continue;
+                return Err(JobError::Internal("rays wait, but nothing was planned".into()));
             }
-            match receive.recv_timeout(Duration::from_millis(200)) {
+            if !started {
+                self.second_attempts(scope);
+            }
+            match receive.recv_timeout(Duration::from_millis(100)) {
                 Ok(message) => self.handle(message)?,
                 Err(RecvTimeoutError::Timeout) => {}
                 Err(RecvTimeoutError::Disconnected) => return Err(JobError::Internal("all threads are gone".into())),
+            }
+            if let Some(owner) = &mut self.owner {
+                let nodes = &self.shared.nodes;
+                nodes.wait(owner.beat(nodes.store().as_ref()))?;
             }
             self.tell();
         }
@@ -175,7 +294,7 @@ impl<'s, 'a> Driver<'s, 'a> {
     fn queue_steps(&mut self) {
         let spp = self.sampling.spp;
         while self.queued < spp {
-            let first = self.queued == 0;
+            let first = !self.begun;
             let wait = self.sampling.target_error.is_some() && !(self.ledger.is_quiet() && self.running.is_empty());
             let late =
                 self.sampling.time_limit.is_some_and(|limit| !first && self.start.elapsed().as_secs_f64() >= limit);
@@ -187,6 +306,7 @@ impl<'s, 'a> Driver<'s, 'a> {
             let end = self.step_end();
             self.cameras.add(self.queued..end, self.ledger.taken());
             self.queued = end;
+            self.begun = true;
             if self.sampling.target_error.is_some() || self.sampling.time_limit.is_some() {
                 return;
             }
@@ -195,14 +315,23 @@ impl<'s, 'a> Driver<'s, 'a> {
 
     /// Where the step that begins at `self.queued` ends: where the schedule says, or before, if time would run out.
     fn step_end(&self) -> u32 {
-        let end = wave::step_end(self.queued).min(self.sampling.spp);
+        // what an earlier run began of a step is finished first
+        let reach = self.ledger.taken().reach();
+        let end = wave::step_end(self.queued).min(self.sampling.spp).max(reach);
         let Some(limit) = self.sampling.time_limit else { return end };
         let elapsed = self.start.elapsed().as_secs_f64();
-        if self.queued == 0 || elapsed <= 0.0 {
+        if !self.begun || elapsed <= 0.0 {
             return end;
         }
-        let samples_left = f64::from(self.queued) / elapsed * (limit - elapsed).max(0.0);
-        end.min(self.queued + (samples_left as u32).max(1))
+        let [w, h] = self.shared.frame.size;
+        let made = self.ledger.rays().camera as f64 / (f64::from(w) * f64::from(h));
+        let samples_left = made / elapsed * (limit - elapsed).max(0.0);
+        end.min(self.queued + (samples_left as u32).max(1)).max(reach)
+    }
+
+    /// Whether everything queued came to its end.
+    fn is_step_over(&self) -> bool {
+        self.ledger.is_quiet() && self.cameras.is_empty() && self.ledger.done().reach() == self.queued
     }
 
     /// After everything queued came to its end: whether the job is over.
@@ -289,27 +418,35 @@ impl<'s, 'a> Driver<'s, 'a> {
             other => other,
         };
         let (task, groups) = self.ledger.start(&Inputs { groups, camera: camera.clone() })?;
-        let name = format!("t{:08}", task.0);
+        let name = format!("{}-t{:08}", self.session, task.0);
         let spec = Attempt { name, node: plan.node, set, groups, camera };
-        self.running.insert(task, Running { attempts: BTreeMap::new(), spec: spec.clone() });
-        self.launch(scope, task, 0, spec);
+        let node = plan.node;
+        self.running.insert(task, Running { spec, started: Instant::now(), attempts: 0 });
+        self.launch(scope, task, node);
         Ok(true)
     }
 
-    /// Starts an attempt on a thread of its own.
-    fn launch<'scope>(&mut self, scope: &'scope Scope<'scope, '_>, task: TaskId, number: u32, mut attempt: Attempt)
+    /// Starts an attempt of a running task on a thread of its own.
+    fn launch<'scope>(&mut self, scope: &'scope Scope<'scope, '_>, task: TaskId, node: u32)
     where
         's: 'scope,
         'a: 'scope,
     {
-        attempt.name = format!("{}-a{number}", attempt.name);
-        let (stop, node) = (StopFlag::default(), attempt.node);
+        let Some(running) = self.running.get_mut(&task) else { return };
+        let number = running.attempts;
+        running.attempts += 1;
+        let attempt = Attempt { name: format!("{}-a{number}", running.spec.name), node, ..running.spec.clone() };
+        let ordinal = self.launched;
+        self.launched += 1;
+        let fate = self.faults.map_or(Fate::Fine, |f| f.fate(ordinal));
+        let stop = StopFlag::new(if let Fate::Kill(batches) = fate { Some(batches) } else { None });
         self.free[node as usize] -= 1;
-        if let Some(running) = self.running.get_mut(&task) {
-            running.attempts.insert(number, Live { node, stop: stop.clone() });
-        }
+        self.live.insert((task, number), Live { node, stop: stop.clone(), ordinal });
         let (shared, gate, send) = (self.shared, self.gate, self.send.clone());
         scope.spawn(move || {
+            if let Fate::Delay(time) = fate {
+                std::thread::sleep(time);
+            }
             let permit = gate.enter();
             let before = usage::thread_cpu();
             // a panic must end the job with a message, not leave it waiting
@@ -322,35 +459,121 @@ impl<'s, 'a> Driver<'s, 'a> {
         });
     }
 
+    /// Starts a second attempt of tasks that take much longer than others did, where nothing else is to be done.
+    fn second_attempts<'scope>(&mut self, scope: &'scope Scope<'scope, '_>)
+    where
+        's: 'scope,
+        'a: 'scope,
+    {
+        let settings = self.shared.settings;
+        let late = settings.straggler_seconds.max(3.0 * settings.task_seconds);
+        let slow = self.running.iter().filter(|(_, r)| r.attempts < 2 && r.started.elapsed().as_secs_f64() > late);
+        let slow: Vec<TaskId> = slow.map(|(&t, _)| t).collect();
+        for task in slow {
+            if !self.gate.has_room() {
+                return;
+            }
+            let Some(first) = self.live.iter().find(|(k, _)| k.0 == task).map(|(_, l)| l.node) else { continue };
+            let same_window = |n: u32| {
+                settings.strategy != plan::Strategy::Auto || self.windows[n as usize] == self.windows[first as usize]
+            };
+            let nodes = (0..self.free.len() as u32).filter(|&n| self.free[n as usize] > 0 && same_window(n));
+            // on another node, if there is one
+            if let Some(node) = nodes.max_by_key(|&n| (n != first, self.free[n as usize]))
+                && self.ledger.again(task).is_ok()
+            {
+                self.launch(scope, task, node);
+            }
+        }
+    }
+
     fn handle(&mut self, message: Message) -> Result<(), JobError> {
         let Message { task, number, result, cpu } = message;
-        let live = self.running.get_mut(&task).and_then(|r| r.attempts.remove(&number));
-        let Some(live) = live else {
+        let Some(live) = self.live.remove(&(task, number)) else {
             return Err(JobError::Internal("an attempt reports that was never started".into()));
         };
         self.free[live.node as usize] += 1;
         self.shared.nodes.busy(live.node, cpu);
-        match result {
-            Ok(made) => self.commit(task, made, cpu),
-            Err(JobError::Stopped) => Ok(()),
-            Err(e) => Err(e),
+        let fate = self.faults.map_or(Fate::Fine, |f| f.fate(live.ordinal));
+        let made = match result {
+            Ok(made) => made,
+            Err(JobError::Stopped) => return self.lost(task, number),
+            Err(e @ JobError::Lost { .. }) => {
+                // of a task that does not run any more, nobody cares
+                self.lost(task, number)?;
+                return if self.committed.contains(&(task, number)) { Ok(()) } else { self.go_back(&e) };
+            }
+            Err(e) => return Err(e),
+        };
+        match fate {
+            Fate::LoseResult => {
+                self.discard(&made.outputs)?;
+                return self.lost(task, number);
+            }
+            Fate::LoseNode => {
+                self.lost(task, number)?;
+                return self.lose_node(live.node);
+            }
+            Fate::Corrupt => self.corrupt(live.ordinal, &made.outputs)?,
+            _ => {}
+        }
+        let twice = (fate == Fate::Duplicate).then(|| Made {
+            film: made.film.clone(),
+            outputs: made.outputs.clone(),
+            hops: made.hops,
+        });
+        self.commit(task, number, made, cpu)?;
+        match twice {
+            Some(made) => self.commit(task, number, made, cpu),
+            None => Ok(()),
         }
     }
 
-    fn commit(&mut self, task: TaskId, made: Made, cpu: f64) -> Result<(), JobError> {
-        let record = self.ledger.record(task, made.outputs)?;
-        let name = format!("r{}", record.sequence);
+    /// An attempt that does not count. If it was the task's last one, its inputs wait again.
+    fn lost(&mut self, task: TaskId, number: u32) -> Result<(), JobError> {
+        if self.ledger.lost(task, number)
+            && let Some(running) = self.running.remove(&task)
+        {
+            self.cameras.give_back(&running.spec.camera);
+        }
+        Ok(())
+    }
+
+    fn commit(&mut self, task: TaskId, number: u32, made: Made, cpu: f64) -> Result<(), JobError> {
+        let settled = self.ledger.is_settled();
+        let record = match self.ledger.record(task, made.outputs.clone()) {
+            Ok(record) => record,
+            // beaten by another attempt, or arrived twice
+            Err(Refused::NotRunning(_)) if self.committed.contains(&(task, number)) => return Ok(()),
+            Err(Refused::NotRunning(_)) => return self.discard(&made.outputs),
+            Err(e) => return Err(e.into()),
+        };
+        if settled && !record.made.groups.is_empty() {
+            self.settled = (self.ledger.snapshot(None), self.film.clone());
+        }
+        let name = self.write(&record)?;
         self.ledger.commit(task, &record, name)?;
+        self.committed.insert((task, number));
         self.film.merge(&made.film)?;
         let made_rays = record.made.rays;
         self.rate.add(cpu, made_rays.closest + made_rays.shadow, made_rays.camera);
         self.tasks += 1;
         self.hops += made.hops;
         self.hop_bytes += record.made.groups.iter().map(|g| g.bytes).sum::<u64>();
+        if let Some(film) = record.made.film {
+            if self.owner.is_some() {
+                self.superfluous[1].push((film.key, film.holders));
+            } else {
+                self.shared.nodes.delete(&[(film.key, film.holders)])?;
+            }
+        }
         if let Some(running) = self.running.remove(&task) {
-            running.attempts.values().for_each(|a| a.stop.set());
-            let consumed: Vec<_> = running.spec.groups.into_iter().map(|g| (g.key, g.holders)).collect();
+            self.live.iter().filter(|(k, _)| k.0 == task).for_each(|(_, l)| l.stop.set());
+            let consumed: Objects = running.spec.groups.into_iter().map(|g| (g.key, g.holders)).collect();
             self.shared.nodes.delete(&consumed)?;
+        }
+        if self.owner.is_some() && self.tasks.is_multiple_of(SNAPSHOT_EVERY) {
+            self.write_snapshot()?;
         }
         if self.progress.wants_preview() {
             let spp = self.ledger.taken().reach().max(1);
@@ -359,8 +582,93 @@ impl<'s, 'a> Driver<'s, 'a> {
         Ok(())
     }
 
+    /// Makes a record durable, if the job keeps records; its name.
+    fn write(&mut self, record: &Record) -> Result<String, JobError> {
+        if self.owner.is_none() {
+            return Ok(record.sequence.to_string());
+        }
+        let name = journal::write(&self.shared.nodes, record)?;
+        self.old_records[1].push(journal::key(record.sequence, &name));
+        Ok(name)
+    }
+
+    /// Writes the whole state, and deletes what the snapshot before this one made superfluous.
+    fn write_snapshot(&mut self) -> Result<(), JobError> {
+        let nodes = &self.shared.nodes;
+        let key = format!("film/{}-s{:08}", self.session, self.ledger.commits());
+        let film = journal::store_film(nodes, &self.film, &key)?;
+        let record = self.ledger.record_of(self.ledger.snapshot(film.clone()));
+        let [old, new] = std::mem::take(&mut self.superfluous);
+        let [old_records, new_records] = std::mem::take(&mut self.old_records);
+        let name = self.write(&record)?;
+        self.ledger.follow_snapshot(&record, name)?;
+        nodes.delete(&old)?;
+        nodes.wait(nodes.store().delete(&old_records))?;
+        self.superfluous = [new, film.into_iter().map(|f| (f.key, f.holders)).collect()];
+        self.old_records[0] = new_records;
+        Ok(())
+    }
+
+    /// Rays were lost with all their copies: back to the last state without rays on their way.
+    fn go_back(&mut self, why: &JobError) -> Result<(), JobError> {
+        tracing::warn!("{why}; what was committed since no ray was on its way is computed again");
+        let before: Objects = self.ledger.snapshot(None).waiting.into_iter().map(|g| (g.key, g.holders)).collect();
+        let (mut snapshot, film) = self.settled.clone();
+        self.redone += self.ledger.commits() - snapshot.commits;
+        if self.owner.is_some() {
+            let key = format!("film/{}-b{:08}-{}", self.session, self.ledger.commits(), self.redone);
+            snapshot.film = journal::store_film(&self.shared.nodes, &film, &key)?;
+        }
+        let record = self.ledger.record_of(snapshot);
+        let name = self.write(&record)?;
+        self.ledger.go_back(&record, name)?;
+        self.film = film;
+        self.stop_all();
+        self.running.clear();
+        self.cameras.clear();
+        self.cameras.add(0..self.queued, self.ledger.taken());
+        self.shared.nodes.delete(&before)
+    }
+
+    /// A node is gone with its disk and what ran on it, and comes back empty. What has other copies is copied again.
+    fn lose_node(&mut self, node: u32) -> Result<(), JobError> {
+        let nodes = &self.shared.nodes;
+        nodes.lose(node)?;
+        self.windows[node as usize].clear();
+        self.live.values().filter(|l| l.node == node).for_each(|l| l.stop.set());
+        for group in self.ledger.snapshot(None).waiting {
+            if group.holders.contains(&node) {
+                let holders = nodes.copy_again(Kind::Rays, &group.key, &group.holders, node)?;
+                self.ledger.relocate(&group.key, holders);
+            }
+        }
+        if self.owner.is_some() {
+            // film parts may have lain there; the sums are here
+            self.write_snapshot()?;
+        }
+        Ok(())
+    }
+
+    /// Deletes what an attempt made that does not count.
+    fn discard(&mut self, outputs: &Outputs) -> Result<(), JobError> {
+        let groups = outputs.groups.iter().map(|g| (g.key.clone(), g.holders.clone()));
+        let film = outputs.film.iter().map(|f| (f.key.clone(), f.holders.clone()));
+        self.shared.nodes.delete(&groups.chain(film).collect::<Objects>())
+    }
+
+    /// A byte of one copy of something that an attempt made changes.
+    fn corrupt(&mut self, ordinal: u64, outputs: &Outputs) -> Result<(), JobError> {
+        let Some(faults) = self.faults else { return Ok(()) };
+        if outputs.groups.is_empty() {
+            return Ok(());
+        }
+        let group = &outputs.groups[faults.pick(ordinal, outputs.groups.len() as u64) as usize];
+        let holder = group.holders[faults.pick(ordinal + 1, group.holders.len() as u64) as usize];
+        self.shared.nodes.corrupt(holder, &group.key, faults.pick(ordinal + 2, group.bytes))
+    }
+
     fn stop_all(&mut self) {
-        self.running.values().flat_map(|r| r.attempts.values()).for_each(|a| a.stop.set());
+        self.live.values().for_each(|l| l.stop.set());
     }
 
     fn tell(&self) {
@@ -378,7 +686,14 @@ impl<'s, 'a> Driver<'s, 'a> {
         });
     }
 
-    fn finish(self) -> Result<JobOutcome, JobError> {
+    fn finish(mut self) -> Result<JobOutcome, JobError> {
+        if self.owner.is_some() {
+            self.write_snapshot()?;
+        }
+        if let Some(owner) = &self.owner {
+            let nodes = &self.shared.nodes;
+            nodes.wait(owner.give_back(nodes.store().as_ref()))?;
+        }
         let spp = self.ledger.done().complete();
         let [width, height] = self.shared.frame.size;
         let settings = self.shared.settings;
@@ -396,6 +711,8 @@ impl<'s, 'a> Driver<'s, 'a> {
             slots: settings.slots(),
             rounds: if settings.has_barrier() { self.rounds } else { self.tasks },
             tasks: self.tasks,
+            tasks_redone: self.redone,
+            tasks_reused: self.reused,
             attempts_lost: self.ledger.attempts_lost(),
             wall_s: self.start.elapsed().as_secs_f64(),
             cpu_s: usage::process_cpu(),

@@ -3,7 +3,10 @@
 pub mod attempt;
 mod cameras;
 mod driver;
+pub mod faults;
+pub mod journal;
 pub mod nodes;
+pub mod owner;
 mod slots;
 #[cfg(test)]
 mod tests;
@@ -14,6 +17,8 @@ use rayherd_render::frame::Frame;
 
 use crate::job::{Image, JobError, JobSettings, PreparedScene, Progress, Sampling};
 use crate::report::Report;
+
+pub use journal::{Collected, collect};
 
 /// What a job made.
 pub struct JobOutcome {

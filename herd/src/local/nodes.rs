@@ -153,6 +153,35 @@ impl<'a> Nodes<'a> {
         Err(JobError::Lost { name: name.to_owned(), why })
     }
 
+    /// After a node was lost: copies an object from another holder, if any is left, to a node without a copy; its holders.
+    pub fn copy_again(&self, kind: Kind, name: &str, holders: &[u32], gone: u32) -> Result<Vec<u32>, JobError> {
+        let mut left: Vec<u32> = holders.iter().copied().filter(|&h| h != gone).collect();
+        let count = self.memories.len() as u32;
+        let to = (1..=count).map(|k| (gone + k) % count).find(|n| !left.contains(n));
+        if let (Some(&from), Some(to)) = (left.first(), to)
+            && let Ok(body) = self.wait(self.store.get(&disk_key(from, name)))
+        {
+            self.count(Stage::Trace, Op::Write, kind, from, Place::Remote, body.len() as u64);
+            self.wait(self.store.put(&disk_key(to, name), body))?;
+            left.push(to);
+        }
+        Ok(left)
+    }
+
+    /// Changes a byte of a copy, for tests.
+    pub fn corrupt(&self, holder: u32, name: &str, at: u64) -> Result<(), JobError> {
+        let key = disk_key(holder, name);
+        if let Ok(body) = self.wait(self.store.get(&key))
+            && !body.is_empty()
+        {
+            let mut bytes = body.to_vec();
+            let at = at as usize % bytes.len();
+            bytes[at] ^= 0x10;
+            self.wait(self.store.put(&key, bytes.into()))?;
+        }
+        Ok(())
+    }
+
     /// Deletes all copies of objects.
     pub fn delete(&self, objects: &[(String, Vec<u32>)]) -> Result<(), JobError> {
         let keys: Vec<String> =

@@ -1,6 +1,6 @@
 //! Threads of slots: how many compute at once, and how an attempt is told to stop.
 
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
 use std::sync::{Arc, Condvar, Mutex, PoisonError};
 
 use crate::job::JobError;
@@ -29,6 +29,10 @@ impl Gate {
         *free -= 1;
         Permit(self)
     }
+    /// Whether a place is free.
+    pub fn has_room(&self) -> bool {
+        *self.free.lock().unwrap_or_else(PoisonError::into_inner) > 0
+    }
 }
 
 impl Drop for Permit<'_> {
@@ -39,18 +43,30 @@ impl Drop for Permit<'_> {
 }
 
 /// Tells an attempt to stop.
-#[derive(Clone, Default)]
-pub struct StopFlag(Arc<AtomicBool>);
+#[derive(Clone)]
+pub struct StopFlag {
+    stop: Arc<AtomicBool>,
+    /// Checks that are left before it stops of itself; none for no such end.
+    left: Option<Arc<AtomicU32>>,
+}
 
 impl StopFlag {
+    /// Stops when it is set, or after so many batches.
+    pub fn new(batches: Option<u32>) -> Self {
+        StopFlag { stop: Arc::default(), left: batches.map(|n| Arc::new(AtomicU32::new(n))) }
+    }
     /// The attempt ends at its next batch.
     pub fn set(&self) {
-        self.0.store(true, Ordering::Relaxed);
+        self.stop.store(true, Ordering::Relaxed);
     }
 }
 
 impl Stop for StopFlag {
     fn check(&self) -> Result<(), JobError> {
-        if self.0.load(Ordering::Relaxed) { Err(JobError::Stopped) } else { Ok(()) }
+        let used_up = self
+            .left
+            .as_ref()
+            .is_some_and(|left| left.fetch_update(Ordering::Relaxed, Ordering::Relaxed, |n| n.checked_sub(1)).is_err());
+        if used_up || self.stop.load(Ordering::Relaxed) { Err(JobError::Stopped) } else { Ok(()) }
     }
 }

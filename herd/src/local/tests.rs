@@ -1,44 +1,350 @@
+use std::collections::BTreeMap;
+use std::num::NonZeroU32;
+use std::sync::{Arc, LazyLock};
+
+use rayherd_render::bvh::{Kernel, Tracer};
+
 use super::*;
-use crate::job::{NodeSpec, Silent};
+use crate::job::{Commits, NodeSpec, Silent};
 use crate::plan::Strategy;
+use crate::store::{BlockStore, MemoryStore};
 use crate::testing;
 
 fn sampling(spp: u32) -> Sampling {
     Sampling { spp, target_error: None, time_limit: None }
 }
 
-fn plain(scene: &PreparedScene, frame: &Frame, spp: u32) -> JobOutcome {
-    render_local(scene, frame, &sampling(spp), &JobSettings::default(), &Silent).unwrap()
+fn nodes(slots: &[u32]) -> Vec<NodeSpec> {
+    slots.iter().map(|&slots| NodeSpec { slots }).collect()
+}
+
+/// The test scene, cut in several ways; the first one is whole.
+static SCENES: LazyLock<Vec<PreparedScene>> = LazyLock::new(|| {
+    let cuts = [(1, true), (4, true), (9, true), (4, false), (9, false)];
+    cuts.map(|(splits, reduced)| testing::prepared(&testing::cornell(), splits, reduced)).into()
+});
+
+fn frame() -> Frame {
+    testing::frame(&SCENES[0], [40, 24], 2)
+}
+
+/// A smaller one, for tests that render many times.
+fn small_frame() -> Frame {
+    testing::frame(&SCENES[0], [14, 10], 2)
+}
+
+/// The picture by samples, made once by a plain run.
+fn expected(spp: u32) -> Arc<FilmPart> {
+    static MADE: LazyLock<std::sync::Mutex<BTreeMap<u32, Arc<FilmPart>>>> = LazyLock::new(Default::default);
+    let mut made = MADE.lock().unwrap();
+    made.entry(spp)
+        .or_insert_with(|| {
+            let settings = JobSettings { kernel: Kernel::Scalar, ..JobSettings::default() };
+            let out = render_local(&SCENES[0], &frame(), &sampling(spp), &settings, &Silent).unwrap();
+            assert!(out.image.pixels.iter().flatten().sum::<f32>() > 10.0);
+            Arc::new(out.film)
+        })
+        .clone()
+}
+
+fn largest(scene: &PreparedScene) -> u64 {
+    (0..scene.splits()).map(|s| scene.split_bytes(s)).max().unwrap()
+}
+
+/// Small tasks, so that there are many.
+fn small(strategy: Strategy, slots: &[u32]) -> JobSettings {
+    JobSettings {
+        strategy,
+        nodes: nodes(slots),
+        replicas: slots.len().min(2) as u32,
+        task_seconds: 0.01,
+        batch: 300,
+        ray_buffer: 1 << 16,
+        ..JobSettings::default()
+    }
+}
+
+fn kernels() -> Vec<Kernel> {
+    let all = [Kernel::Scalar, Kernel::Avx2, Kernel::Avx512, Kernel::Auto];
+    all.into_iter().filter(|&k| Tracer::new(k).is_ok()).collect()
 }
 
 #[test]
 fn every_strategy_makes_the_same_bytes() {
-    let whole = testing::prepared(&testing::cornell(), 1, true);
-    let frame = testing::frame(&whole, [40, 24], 2);
-    let expected = plain(&whole, &frame, 5);
-    assert!(expected.image.pixels.iter().flatten().sum::<f32>() > 10.0);
-    for reduced in [true, false] {
-        for splits in [1, 4, 9] {
-            let scene = testing::prepared(&testing::cornell(), splits, reduced);
-            let largest = (0..scene.splits()).map(|s| scene.split_bytes(s)).max().unwrap();
-            for strategy in Strategy::ALL {
-                for nodes in [vec![1], vec![2, 1, 1]] {
-                    let memory = Some(2 * largest);
-                    let settings = JobSettings {
-                        strategy,
-                        nodes: nodes.iter().map(|&slots| NodeSpec { slots }).collect(),
-                        memory_per_node: memory,
-                        replicas: nodes.len().min(2) as u32,
-                        batch: 300,
-                        ray_buffer: 1 << 16,
-                        ..JobSettings::default()
-                    };
-                    let made = render_local(&scene, &frame, &sampling(5), &settings, &Silent);
-                    let made = made.unwrap_or_else(|e| panic!("{strategy} {splits} {reduced} {nodes:?}: {e}"));
-                    assert!(made.film == expected.film, "{strategy}, {splits} splits, reduced {reduced}, {nodes:?}");
-                    assert_eq!(made.report.rays, expected.report.rays);
-                }
+    let expected = expected(5);
+    let kernels = kernels();
+    let mut n = 0;
+    for scene in SCENES.iter() {
+        for strategy in Strategy::ALL {
+            for slots in [&[1][..], &[2, 1, 1]] {
+                let settings = JobSettings {
+                    memory_per_node: Some(if n % 5 == 4 { 1 << 30 } else { (2 + n % 2) * largest(scene) }),
+                    batch: [1 << 14, 300, 37][n as usize % 3],
+                    kernel: kernels[n as usize % kernels.len()],
+                    threads: NonZeroU32::new(1 + n as u32 % 3),
+                    barrier: [None, Some(true), Some(false)][n as usize % 3],
+                    ..small(strategy, slots)
+                };
+                n += 1;
+                let made = render_local(scene, &frame(), &sampling(5), &settings, &Silent);
+                let made = made.unwrap_or_else(|e| panic!("{settings:?}: {e}"));
+                assert!(made.film == *expected, "{settings:?} on {} splits", scene.splits());
+                assert_eq!(made.report.spp, 5);
+                assert!(
+                    made.report.nodes_detail.iter().all(|d| d.peak_scene_bytes <= settings.memory_per_node.unwrap())
+                );
             }
         }
     }
+}
+
+#[test]
+fn a_furnace_has_its_closed_form_through_every_strategy() {
+    let scene = testing::prepared(&testing::furnace(), 5, true);
+    // emission seen after 0, 1, 2 and 3 reflections of one half
+    let frame = Frame { max_depth: 4, rr_depth: 100, ..testing::frame(&scene, [12, 12], 1) };
+    let frame = Frame { camera: camera_inside(&scene, [12, 12]), ..frame };
+    let exact = 1.0 + 0.5 + 0.25 + 0.125;
+    for strategy in Strategy::ALL {
+        let settings = JobSettings { memory_per_node: Some(2 * largest(&scene)), ..small(strategy, &[1, 1]) };
+        let made = render_local(&scene, &frame, &sampling(64), &settings, &Silent).unwrap();
+        let values: Vec<f64> = made.image.pixels.iter().map(|p| f64::from(p[1])).collect();
+        let n = values.len() as f64;
+        let mean = values.iter().sum::<f64>() / n;
+        let variance = values.iter().map(|x| (x - mean).powi(2)).sum::<f64>() / (n - 1.0);
+        let error = (variance / n).sqrt();
+        assert!((mean - exact).abs() < 4.0 * error && error < 0.005 * exact, "{strategy}: {mean} +- {error}");
+    }
+}
+
+fn camera_inside(scene: &PreparedScene, size: [u32; 2]) -> rayherd_render::camera::Camera {
+    let to_world = [[-1.0, 0.0, 0.0, 0.3], [0.0, 1.0, 0.0, 0.2], [0.0, 0.0, -1.0, 0.1]];
+    rayherd_render::camera::Camera::new(&to_world, 60.0, size, scene.manifest.offset).unwrap()
+}
+
+#[test]
+fn a_scene_that_fits_is_divided_and_no_ray_travels() {
+    let settings = JobSettings { nodes: nodes(&[1, 1, 1]), replicas: 2, ..small(Strategy::Auto, &[1, 1, 1]) };
+    let made = render_local(&SCENES[2], &frame(), &sampling(5), &settings, &Silent).unwrap();
+    assert!(made.film == *expected(5));
+    assert_eq!((made.report.hops, made.report.bytes_per_hop, made.report.rounds), (0, None, made.report.tasks));
+    let rays = made.report.rays;
+    assert_eq!((rays.camera, rays.merged), (40 * 24 * 5, 40 * 24 * 5));
+    assert!(rays.closest > rays.camera && rays.shadow > 0);
+}
+
+#[test]
+fn too_little_memory_says_how_much_is_needed() {
+    let scene = &SCENES[1];
+    let needed = largest(scene);
+    let settings = JobSettings { memory_per_node: Some(needed - 1), ..JobSettings::default() };
+    let error = render_local(scene, &frame(), &sampling(1), &settings, &Silent).err().unwrap();
+    assert!(error.to_string().contains(&needed.to_string()) && error.is_users(), "{error}");
+}
+
+#[test]
+fn a_target_error_ends_a_run_that_a_longer_one_repeats() {
+    let target = Sampling { spp: 4096, target_error: Some(0.2), time_limit: None };
+    let made = render_local(&SCENES[1], &frame(), &target, &small(Strategy::Auto, &[2]), &Silent).unwrap();
+    assert_eq!(made.report.target_reached, Some(true));
+    assert!(made.report.rel_mse.unwrap() <= 0.2 && made.spp < 4096, "{:?}", made.report.rel_mse);
+    assert!(made.film == *expected(made.spp));
+    let late = Sampling { spp: 1 << 20, target_error: None, time_limit: Some(0.0) };
+    let made = render_local(&SCENES[1], &frame(), &late, &small(Strategy::Auto, &[2]), &Silent).unwrap();
+    assert!(made.film == *expected(made.spp) && made.spp < 100);
+}
+
+fn with_store(store: &Arc<MemoryStore>, resume: bool, settings: JobSettings) -> JobSettings {
+    let commits = Commits { store: store.clone(), resume, takeover: false };
+    JobSettings { commits: Some(commits), ..settings }
+}
+
+#[test]
+fn more_samples_continue_a_finished_image() {
+    for strategy in Strategy::ALL {
+        let store = Arc::new(MemoryStore::default());
+        let settings = JobSettings { memory_per_node: Some(2 * largest(&SCENES[1])), ..small(strategy, &[1, 2]) };
+        let first =
+            render_local(&SCENES[1], &frame(), &sampling(3), &with_store(&store, false, settings.clone()), &Silent);
+        assert!(first.unwrap().film == *expected(3));
+        let again = with_store(&store, false, settings.clone());
+        assert!(matches!(
+            render_local(&SCENES[1], &frame(), &sampling(5), &again, &Silent),
+            Err(JobError::Settings(_))
+        ));
+        let more =
+            render_local(&SCENES[1], &frame(), &sampling(5), &with_store(&store, true, settings.clone()), &Silent)
+                .unwrap();
+        assert!(more.film == *expected(5), "{strategy}");
+        assert!(more.report.tasks_reused > 0 && more.report.rays.camera == 40 * 24 * 5);
+        // another cut of the same scene goes on as well, as nothing waits
+        let finished = render_local(
+            &SCENES[2],
+            &frame(),
+            &sampling(5),
+            &with_store(&store, true, JobSettings::default()),
+            &Silent,
+        )
+        .unwrap();
+        assert!(finished.film == *expected(5) && finished.report.tasks == 0);
+        let fewer = render_local(&SCENES[1], &frame(), &sampling(4), &with_store(&store, true, settings), &Silent);
+        assert!(fewer.err().unwrap().to_string().contains("5 samples"));
+        let other = Frame { seed: 8, ..frame() };
+        let other =
+            render_local(&SCENES[1], &other, &sampling(5), &with_store(&store, true, JobSettings::default()), &Silent);
+        assert!(matches!(other, Err(JobError::Chain(_))));
+    }
+}
+
+/// Stops a job by an error after some commits, as a kill would, but for the owner object.
+struct Crash {
+    after: u64,
+    store: Arc<MemoryStore>,
+}
+
+#[async_trait::async_trait]
+impl BlockStore for Crash {
+    async fn put(&self, key: &str, body: bytes::Bytes) -> Result<(), crate::store::StoreError> {
+        let records = self.store.list("records/").await?;
+        let last = records.last().map_or(0, |r| r.0[8..18].parse::<u64>().unwrap() + 1);
+        if last >= self.after && key != "owner" {
+            return Err(crate::store::StoreError::Unavailable {
+                store: self.describe(),
+                action: "put",
+                key: key.to_owned(),
+                message: "the test says so".into(),
+            });
+        }
+        self.store.put(key, body).await
+    }
+    async fn get(&self, key: &str) -> Result<bytes::Bytes, crate::store::StoreError> {
+        self.store.get(key).await
+    }
+    async fn size(&self, key: &str) -> Result<Option<u64>, crate::store::StoreError> {
+        self.store.size(key).await
+    }
+    async fn list(&self, prefix: &str) -> Result<Vec<(String, u64)>, crate::store::StoreError> {
+        self.store.list(prefix).await
+    }
+    async fn delete(&self, keys: &[String]) -> Result<(), crate::store::StoreError> {
+        self.store.delete(keys).await
+    }
+    fn describe(&self) -> String {
+        "a store that fails".into()
+    }
+}
+
+#[test]
+fn what_was_committed_before_a_crash_is_taken_over() {
+    let runtime = tokio::runtime::Builder::new_current_thread().build().unwrap();
+    for (i, strategy) in Strategy::ALL.into_iter().enumerate() {
+        let store = Arc::new(MemoryStore::default());
+        let settings = JobSettings {
+            memory_per_node: Some(2 * largest(&SCENES[1])),
+            task_seconds: 0.002,
+            ..small(strategy, if i % 2 == 0 { &[1] } else { &[1, 1] })
+        };
+        let mut crashes = 0;
+        let mut reused = 0;
+        for after in (3..).step_by(9) {
+            let failing = Arc::new(Crash { after, store: store.clone() });
+            let commits = Commits { store: failing, resume: true, takeover: true };
+            let settings = JobSettings { commits: Some(commits), ..settings.clone() };
+            match render_local(&SCENES[1], &frame(), &sampling(5), &settings, &Silent) {
+                Ok(made) => {
+                    assert!(made.film == *expected(5), "{strategy}");
+                    reused = made.report.tasks_reused;
+                    break;
+                }
+                Err(JobError::Store(_)) => crashes += 1,
+                Err(e) => panic!("{strategy}: {e}"),
+            }
+            if crashes == 2 {
+                // in the middle of everything, a collection takes nothing that is needed
+                runtime.block_on(store.delete(&["owner".to_owned()])).unwrap();
+                let collected = runtime.block_on(collect(store.as_ref())).unwrap();
+                assert!(collected.kept > 0);
+            }
+        }
+        assert!(crashes > 0 && reused > 0, "{strategy}: {crashes} crashes, {reused} reused");
+    }
+}
+
+#[test]
+fn corrupt_objects_are_found_and_computed_again() {
+    let runtime = tokio::runtime::Builder::new_current_thread().build().unwrap();
+    let settings = JobSettings { memory_per_node: Some(2 * largest(&SCENES[1])), ..small(Strategy::Auto, &[1]) };
+    for prefix in ["records/", "nodes/0/film/", "nodes/0/rays/"] {
+        let store = Arc::new(MemoryStore::default());
+        let failing = Arc::new(Crash { after: 9, store: store.clone() });
+        let crashing =
+            JobSettings { commits: Some(Commits { store: failing, resume: true, takeover: true }), ..settings.clone() };
+        assert!(render_local(&SCENES[1], &frame(), &sampling(5), &crashing, &Silent).is_err());
+        let keys = runtime.block_on(store.list(prefix)).unwrap();
+        let last = &keys.last().unwrap_or_else(|| panic!("nothing in {prefix}")).0;
+        let mut body = runtime.block_on(store.get(last)).unwrap().to_vec();
+        let middle = body.len() / 2;
+        body[middle] ^= 1;
+        runtime.block_on(store.put(last, body.into())).unwrap();
+        let commits = Commits { store: store.clone(), resume: true, takeover: true };
+        let made = render_local(
+            &SCENES[1],
+            &frame(),
+            &sampling(5),
+            &JobSettings { commits: Some(commits), ..settings.clone() },
+            &Silent,
+        )
+        .unwrap();
+        assert!(made.film == *expected(5), "{prefix}");
+    }
+}
+
+/// Random settings and faults from a seed; replay one with `RAYHERD_FAULT_SEED=n cargo test -p rayherd-herd random_faults`.
+fn random_case(seed: u64) -> (&'static PreparedScene, JobSettings) {
+    let pick = |i: u64, n: u64| faults::Faults::new(seed ^ 0x5eed).pick(i, n);
+    let scene = &SCENES[pick(0, SCENES.len() as u64) as usize];
+    let slots: Vec<u32> = (0..1 + pick(1, 4)).map(|i| 1 + pick(20 + i, 3) as u32).collect();
+    let kernels = kernels();
+    let settings = JobSettings {
+        memory_per_node: [None, Some(largest(scene)), Some(2 * largest(scene)), Some(3 * largest(scene))]
+            [pick(2, 4) as usize],
+        replicas: 1 + pick(3, slots.len().min(3) as u64) as u32,
+        barrier: [None, Some(true), Some(false)][pick(4, 3) as usize],
+        task_seconds: [0.002, 0.01, 10.0][pick(5, 3) as usize],
+        straggler_seconds: 0.01,
+        threads: NonZeroU32::new(1 + pick(6, 3) as u32),
+        kernel: kernels[pick(7, kernels.len() as u64) as usize],
+        batch: [30, 300, 4000][pick(8, 3) as usize],
+        ray_buffer: [1 << 14, 1 << 20][pick(9, 2) as usize],
+        faults: Some(seed),
+        ..small(Strategy::ALL[pick(10, 4) as usize], &slots)
+    };
+    let settings =
+        if pick(11, 3) == 0 { with_store(&Arc::new(MemoryStore::default()), false, settings) } else { settings };
+    (scene, settings)
+}
+
+#[test]
+fn random_faults_change_nothing() {
+    let from_env = |name: &str| std::env::var(name).ok().and_then(|v| v.parse::<u64>().ok());
+    let seeds = match from_env("RAYHERD_FAULT_SEED") {
+        Some(seed) => seed..seed + 1,
+        None => 0..from_env("RAYHERD_FAULT_CASES").unwrap_or(200),
+    };
+    let (mut lost, mut redone) = (0, 0);
+    let plain = JobSettings { kernel: Kernel::Scalar, ..JobSettings::default() };
+    let expected = render_local(&SCENES[0], &small_frame(), &sampling(2), &plain, &Silent).unwrap().film;
+    let many = seeds.end - seeds.start > 1;
+    for seed in seeds {
+        let (scene, settings) = random_case(seed);
+        let made = render_local(scene, &small_frame(), &sampling(2), &settings, &Silent);
+        let replay =
+            format!("replay with RAYHERD_FAULT_SEED={seed} cargo test -p rayherd-herd random_faults; {settings:?}");
+        let made = made.unwrap_or_else(|e| panic!("{e}: {replay}"));
+        assert!(made.film == expected, "another image: {replay}");
+        lost += made.report.attempts_lost;
+        redone += made.report.tasks_redone;
+    }
+    // the schedules do what they are for
+    assert!(!many || (lost > 100 && redone > 10), "{lost} attempts lost, {redone} tasks computed again");
 }

@@ -1,14 +1,26 @@
-//! Rays and film parts as the bodies of objects.
+//! Rays and film parts as the bodies of objects, checked against the scene.
 
 use bytes::Bytes;
 use rayherd_render::film::FilmPart;
 
+use crate::flight::Flights;
+use crate::job::PreparedScene;
 use crate::wire::WireError;
 use crate::wire::envelope::{Compress, Kind, open, seal};
-pub use crate::wire::ray_group::{decode as decode_rays, encode as encode_rays};
 
-/// Largest body that is read.
-pub const LIMIT: usize = 1 << 30;
+/// Largest film that is read, bytes: 96 a pixel at most, so some ten million pixels.
+const FILM_LIMIT: usize = 1 << 30;
+
+/// Whether rays name only splits and cells that the scene has.
+pub fn check_rays(scene: &PreparedScene, rays: &Flights) -> Result<(), WireError> {
+    let (splits, cells) = (scene.splits(), scene.grid.occupied());
+    let visits = rays.paths.iter().map(|f| f.visit).chain(rays.shadows.iter().map(|f| f.visit));
+    let lost = rays.paths.iter().any(|f| f.candidate.is_hit() && f.candidate.split >= splits);
+    if lost || visits.into_iter().any(|v| v.progress.0 > cells) {
+        return Err(WireError::corrupt("a ray names a split or a cell that the scene lacks"));
+    }
+    Ok(())
+}
 
 /// A film part as an object.
 pub fn encode_film(film: &FilmPart) -> Bytes {
@@ -17,6 +29,6 @@ pub fn encode_film(film: &FilmPart) -> Bytes {
 
 /// A film part from an object.
 pub fn decode_film(size: [u32; 2], body: &[u8]) -> Result<FilmPart, WireError> {
-    let payload = open(Kind::FilmPart, body, LIMIT)?;
+    let payload = open(Kind::FilmPart, body, FILM_LIMIT)?;
     FilmPart::decode(&payload, size).map_err(|e| WireError::corrupt(e.to_string()))
 }

@@ -94,6 +94,30 @@ pub fn cornell() -> Description {
     }
 }
 
+/// A closed box whose walls all emit 1 and reflect half of what they get.
+pub fn furnace() -> Description {
+    let half = material("half", Bsdf::Diffuse { reflectance: [0.5; 3] });
+    let corner = |x: f64| [x, x, x];
+    let (u, v, w) = ([4.0, 0.0, 0.0], [0.0, 4.0, 0.0], [0.0, 0.0, 4.0]);
+    let minus = |a: [f64; 3]| a.map(|x| -x);
+    let wall = |name, c, a, b| shape(name, sheet(c, a, b, 3), 0, Some([1.0; 3]));
+    let (lo, hi) = (corner(-2.0), corner(2.0));
+    Description {
+        // fronts are inside
+        shapes: vec![
+            wall("back", lo, u, v),
+            wall("left", lo, v, w),
+            wall("floor", lo, w, u),
+            wall("front", hi, minus(v), minus(u)),
+            wall("right", hi, minus(w), minus(v)),
+            wall("ceiling", hi, minus(u), minus(w)),
+        ],
+        materials: vec![half],
+        environment: None,
+        ..cornell()
+    }
+}
+
 /// Prepares a description, cut into splits, into memory.
 pub fn prepared(description: &Description, splits: u32, overlap_reduction: bool) -> PreparedScene {
     let objects = Arc::new(MemoryObjects::default());
