@@ -2,12 +2,13 @@
 //!
 //! Samples above the value are inside the material (for CT: what is denser), and triangles are counter-clockwise seen from
 //! outside it. The surface is closed, but for the volume's border, where it ends. Its topology is that of the trilinear
-//! interpolant (see [`tables`]). In memory are two slices of samples. Triangles of zero area, which come of samples that equal
-//! the value, are in the stream, and so are triangles with NaN, which come of such samples.
+//! interpolant, but for one case (see the tables). In memory are two slices of samples, and nothing grows with the volume.
+//! Triangles of zero area are in the stream and keep their ids: they come of samples that equal the value. Samples that
+//! are NaN are outside, and the vertices beside them are NaN.
 
 mod interior;
 mod march;
-pub mod tables;
+mod tables;
 #[cfg(test)]
 mod tests;
 

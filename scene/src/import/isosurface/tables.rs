@@ -44,9 +44,10 @@ pub struct Entry {
     pub tubes: Vec<Tube>,
     /// Lowest corner of the region of the cell's surface to which each corner belongs.
     pub region: [u8; 8],
-    /// Two outsides at opposite corners, all else inside (case 4 turned inside out). Here we do as Lewiner's code does (and
-    /// scikit-image and all who took it over), so that counts of triangles can be compared with theirs: it takes the
-    /// tube also where the interpolant has none. Both fillings have the same boundary, so the surface stays closed.
+    /// Two outsides at opposite corners, all else inside (case 4 turned inside out). Here we do mostly as Lewiner's code does
+    /// (and scikit-image and all who took it over), so that counts of triangles can be compared with theirs: it takes the
+    /// tube also where the interpolant has none. Both fillings have the same boundary, so the surface stays closed. It is
+    /// 42 cells of the head in shared/data, 0.2 % of its triangles, and 756 cells of the chest at 110.5, 0.04 %.
     pub outsides_opposed: bool,
 }
 

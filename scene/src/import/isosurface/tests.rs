@@ -331,6 +331,71 @@ fn tubes_are_there() {
     assert!(found > 1000);
 }
 
+/// The plain twin of decider and interior test: samples of the interpolant on a fine grid. Two neighbouring samples of one sign
+/// are connected, as the interpolant is linear between them; so what is connected there must be connected here. The
+/// other way round thin connections are missed by the grid: few.
+#[test]
+fn connections_are_those_of_the_interpolant() {
+    const N: usize = 24;
+    let mut random = Random(11);
+    let (mut both, mut only_here) = (0, 0);
+    let mut cells = 0;
+    while cells < 800 {
+        let d: [f64; 8] = std::array::from_fn(|_| random.signed());
+        let entry = march::classify(&d).0;
+        if entry.tubes.is_empty() {
+            continue;
+        }
+        cells += 1;
+        let mut region = entry.region;
+        interior::connect(&d, &mut region);
+        let at = |p: [usize; 3]| (p[2] * (N + 1) + p[1]) * (N + 1) + p[0];
+        let inside = fill([N + 1; 3], |p| {
+            let t = p.map(|v| v / N as f64);
+            let weight = |c: usize| (0..3).map(|k| if c >> k & 1 == 1 { t[k] } else { 1.0 - t[k] }).product::<f64>();
+            (0..8).map(|c| d[c] * weight(c)).sum()
+        });
+        let mut group = vec![usize::MAX; inside.len()];
+        for corner in 0..8usize {
+            let start = [0, 1, 2].map(|k| (corner >> k & 1) * N);
+            if group[at(start)] != usize::MAX {
+                continue;
+            }
+            let mut todo = vec![start];
+            group[at(start)] = corner;
+            while let Some(p) = todo.pop() {
+                for k in 0..3 {
+                    for next in [p[k].wrapping_sub(1), p[k] + 1] {
+                        let mut q = p;
+                        q[k] = next;
+                        if next <= N && group[at(q)] == usize::MAX && (inside[at(q)] > 0.0) == (inside[at(p)] > 0.0) {
+                            group[at(q)] = corner;
+                            todo.push(q);
+                        }
+                    }
+                }
+            }
+        }
+        for a in 0..8usize {
+            for b in a + 1..8 {
+                if (d[a] > 0.0) != (d[b] > 0.0) {
+                    continue;
+                }
+                let grid = [a, b].map(|c| group[at([0, 1, 2].map(|k| (c >> k & 1) * N))]);
+                match (grid[0] == grid[1], region[a] == region[b]) {
+                    (true, here) => {
+                        assert!(here, "{a} {b} {d:?}");
+                        both += 1;
+                    }
+                    (false, true) => only_here += 1,
+                    (false, false) => {}
+                }
+            }
+        }
+    }
+    assert!(only_here * 50 < both, "{only_here} {both}");
+}
+
 /// The head of shared/data: the count of scikit-image 0.26 (78,736).
 #[test]
 fn head() {
