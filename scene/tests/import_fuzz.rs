@@ -85,11 +85,19 @@ const WORDS: &[&str] = &[
     "type=\"cube\"",
 ];
 
+/// The word that begins at or after a place.
+fn word(bytes: &[u8], at: usize) -> std::ops::Range<usize> {
+    let part = |b: &u8| b.is_ascii_alphanumeric() || b"._-+#$".contains(b);
+    let start = at + bytes[at..].iter().take_while(|b| !part(b)).count();
+    start..start + bytes[start..].iter().take_while(|b| part(b)).count()
+}
+
 fn mutate(seed: &[u8], random: &mut Random) -> Vec<u8> {
     let mut out = seed.to_vec();
-    for _ in 0..1 + random.below(4) {
+    // mostly one change: two seldom get past the first check
+    for _ in 0..1 + random.below(5) / 4 {
         let range = random.range(out.len());
-        match random.below(8) {
+        match random.below(11) {
             0 => out.truncate(range.start),
             1 => drop(out.drain(range)),
             2 => {
@@ -113,6 +121,13 @@ fn mutate(seed: &[u8], random: &mut Random) -> Vec<u8> {
                 let start = range.start + out[range.start..].iter().take_while(|b| !digits(b)).count();
                 let end = start + out[start..].iter().take_while(|b| digits(b)).count();
                 out.splice(start..end, WORDS[random.below(20)].bytes());
+            }
+            // a word becomes another of the same file
+            7..=9 => {
+                let from = word(&out, random.below(out.len() + 1));
+                let new = out[from].to_vec();
+                let to = word(&out, range.start);
+                out.splice(to, new);
             }
             _ => {
                 let at = range.start;
