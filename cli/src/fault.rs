@@ -7,6 +7,7 @@ use rayherd_scene::ImportError;
 use rayherd_scene::manifest::ManifestError;
 use rayherd_scene::objects::ObjectError;
 use rayherd_scene::prepare::PrepareError;
+use rayherd_scene::tools::ToolError;
 
 /// Something that the user can put right. The message says what and where, and what to do.
 #[derive(Debug, thiserror::Error)]
@@ -33,6 +34,11 @@ fn is_users(cause: &(dyn std::error::Error + 'static)) -> bool {
             PrepareError::Inconsistent(_) | PrepareError::Spool { .. } => false,
         })
         || cause.downcast_ref().is_some_and(JobError::is_users)
+        || cause.downcast_ref().is_some_and(|e| match e {
+            ToolError::Import(e) => import_is_users(e),
+            ToolError::Write { source, .. } => is_wrong_path(source),
+            ToolError::Refused(_) => true,
+        })
         || cause.downcast_ref().is_some_and(|e| match e {
             ManifestError::Malformed(_) | ManifestError::Format { .. } => true,
             ManifestError::Store(e) => object_is_users(e),

@@ -4,6 +4,7 @@
 //! problem of a field is told in the user's own words by [`check`].
 
 use std::path::Path;
+use std::str::FromStr;
 
 use clap::Args;
 use rayherd_api::{ByteSize, LightSpec, RenderJob, RenderJobSpec};
@@ -111,6 +112,11 @@ fn flag(field: &str) -> String {
         dash.into_iter().chain(std::iter::once(c.to_ascii_lowercase()))
     });
     std::iter::once('-').chain(std::iter::once('-')).chain(kebab).collect()
+}
+
+/// Numbers between commas.
+pub fn numbers<T: FromStr>(text: &str) -> Result<Vec<T>, String> {
+    text.split(',').map(|n| n.trim().parse().map_err(|_| format!("{n:?} is no number"))).collect()
 }
 
 /// What importing is told, by a job that was checked.

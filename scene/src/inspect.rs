@@ -195,7 +195,7 @@ impl Picture {
 fn colour(split: u32) -> [u8; 3] {
     // 2^32 / golden ratio: multiplication wraps around the circle of hues
     let hue = split.wrapping_mul(2_654_435_769);
-    let bright = if split.count_ones() % 2 == 0 { 235 } else { 180 };
+    let bright = if split.count_ones().is_multiple_of(2) { 235 } else { 180 };
     let sixth = (hue >> 8) * 6;
     let (sector, f) = (sixth >> 24, (sixth >> 16) & 0xff);
     let floor = bright / 4;

@@ -10,7 +10,7 @@ use rayherd_scene::inspect::{Picture, picture, summary};
 use rayherd_scene::manifest::Manifest;
 use rayherd_scene::objects::{DirectoryObjects, ObjectRef, ObjectStore};
 
-use super::print;
+use super::{print, size};
 use crate::fault::Mistake;
 use crate::output::{png_file, replace};
 
@@ -105,16 +105,4 @@ fn split_table(m: &Manifest) -> String {
         );
     }
     t
-}
-
-/// A number of bytes with three or four digits.
-pub fn size(bytes: u64) -> String {
-    let mut value = bytes as f64;
-    for unit in ["B", "KiB", "MiB", "GiB"] {
-        if value < 1000.0 {
-            return if unit == "B" { format!("{bytes} B") } else { format!("{value:.1} {unit}") };
-        }
-        value /= 1024.0;
-    }
-    format!("{value:.1} TiB")
 }

@@ -4,6 +4,7 @@ mod compare;
 mod inspect;
 mod prepare;
 mod render;
+mod scene;
 
 use std::io::Write;
 use std::process::ExitCode;
@@ -17,6 +18,7 @@ pub enum Command {
     Prepare(prepare::Arguments),
     Inspect(inspect::Arguments),
     Compare(compare::Arguments),
+    Scene(scene::Arguments),
 }
 
 /// Does it. The code is the command's answer; an error is told by the caller.
@@ -24,6 +26,7 @@ pub fn run(command: Command) -> anyhow::Result<ExitCode> {
     match command {
         Command::Render(arguments) => render::run(&arguments),
         Command::Compare(arguments) => compare::run(&arguments),
+        Command::Scene(arguments) => scene::run(&arguments),
         Command::Inspect(arguments) => inspect::run(&arguments),
         Command::Prepare(arguments) => prepare::run(&arguments),
     }
@@ -36,4 +39,16 @@ fn print(text: &str) -> anyhow::Result<()> {
         Err(e) if e.kind() != std::io::ErrorKind::BrokenPipe => Err(e.into()),
         _ => Ok(()),
     }
+}
+
+/// A number of bytes with three or four digits.
+fn size(bytes: u64) -> String {
+    let mut value = bytes as f64;
+    for unit in ["B", "KiB", "MiB", "GiB"] {
+        if value < 1000.0 {
+            return if unit == "B" { format!("{bytes} B") } else { format!("{value:.1} {unit}") };
+        }
+        value /= 1024.0;
+    }
+    format!("{value:.1} TiB")
 }

@@ -8,8 +8,7 @@ use clap::Args;
 use rayherd_api::{ImageSize, RenderJob, RenderJobSpec, Strategy};
 use rayherd_scene::objects::{DirectoryObjects, ObjectStore};
 
-use super::inspect::size;
-use super::print;
+use super::{print, size};
 use crate::options::{self, CutOptions, SceneOptions};
 use crate::source;
 
