@@ -88,7 +88,7 @@ pub enum BuildError {
 /// Builds a geometry object.
 ///
 /// Ids ascend within each kind. `fork` is asked to share the work; the bytes do not depend on it. Memory while it runs is
-/// some 200 bytes per primitive beside the result's 50.
+/// some 100 bytes per primitive beside the result's 50.
 ///
 /// # Errors
 /// See [`BuildError`].
@@ -164,15 +164,16 @@ pub fn build_block(
     Ok(out)
 }
 
-/// Bytes of an object's arena, at least one unit and at most the object's own, and its number of primitives: as the header
-/// says, which nobody has checked.
+/// Bytes of an object's arena, at least one unit, and its number of primitives: as the header says, which nobody has checked,
+/// but at most what the object has room for.
 pub(super) fn sizes(geometry: &[u8]) -> (u64, u32) {
     let unit = NODE_ALIGN as u64;
     if geometry.len() < HEADER {
         return (unit, 0);
     }
     let arena = read_u64(geometry, 72).min(geometry.len() as u64).next_multiple_of(unit).max(unit);
-    (arena, read_u32(geometry, 12).saturating_add(read_u32(geometry, 16)))
+    let most = geometry.len() / PRIMITIVE_BYTES;
+    (arena, read_u32(geometry, 12).saturating_add(read_u32(geometry, 16)).min(most as u32))
 }
 
 fn check_ids(primitives: usize, ids: &[PrimId]) -> Result<(), BuildError> {

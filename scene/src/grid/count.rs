@@ -44,13 +44,41 @@ impl Candidate {
 /// Tables of all candidates together hold at most this many cells (12 bytes each).
 const MOST_CELLS: usize = 24 << 20;
 
-/// One split's primitives as counting needs them.
-#[derive(Clone, Copy, Debug)]
+/// One split's primitives as counting needs them, made once for all candidates.
+#[derive(Clone, Debug)]
 pub struct Primitives<'a> {
-    /// Vertices.
-    pub triangles: &'a [[[f32; 3]; 3]],
+    triangles: &'a [[[f32; 3]; 3]],
+    /// Box of every [`RUN`] triangles.
+    runs: Vec<Box3>,
     /// Centre and radius.
-    pub spheres: &'a [([f32; 3], f32)],
+    spheres: Vec<([f32; 3], f32)>,
+}
+
+/// Lower and upper corner.
+pub(crate) type Box3 = [[f32; 3]; 2];
+
+/// Triangles that are looked at together first: neighbours in the file are neighbours in space.
+pub(crate) const RUN: usize = 16;
+
+impl<'a> Primitives<'a> {
+    /// From vertices, and centres and radii.
+    pub fn new(triangles: &'a [[[f32; 3]; 3]], spheres: Vec<([f32; 3], f32)>) -> Self {
+        let runs = triangles.chunks(RUN).map(|run| box_of(run.as_flattened())).collect();
+        Primitives { triangles, runs, spheres }
+    }
+}
+
+/// Box of points.
+#[inline]
+pub(crate) fn box_of(points: &[[f32; 3]]) -> Box3 {
+    let mut out = [[f32::INFINITY; 3], [f32::NEG_INFINITY; 3]];
+    for p in points {
+        for a in 0..3 {
+            out[0][a] = out[0][a].min(p[a]);
+            out[1][a] = out[1][a].max(p[a]);
+        }
+    }
+    out
 }
 
 /// Subdivisions worth counting for so many splits, ascending: from ceil(cbrt(splits)), the paper's start, to where even
@@ -112,37 +140,32 @@ impl Counter {
     }
 
     /// Adds a split. Splits come by ascending number, each in one or several calls.
-    pub fn add(&mut self, split: u32, primitives: Primitives) {
+    pub fn add(&mut self, split: u32, primitives: &Primitives) {
         let Counter { lattice, cells } = self;
-        let mut touch = |at: [u32; 3]| {
+        let mut touch = |at: [u32; 3], primitives: u32| {
             let cell = &mut cells[lattice.index(at) as usize];
-            cell.primitives = cell.primitives.saturating_add(1);
+            cell.primitives = cell.primitives.saturating_add(primitives);
             if cell.last != split {
                 cell.last = split;
                 cell.owners += 1;
             }
         };
-        // neighbours in the file are neighbours in space: most triangles lie in the cell of the one before
         let mut inside = Inside::NOWHERE;
-        for p in primitives.triangles {
-            if inside.holds(p) {
-                touch(inside.at);
+        for (run, bounds) in primitives.triangles.chunks(RUN).zip(&primitives.runs) {
+            if inside.moves_to(lattice, bounds) {
+                touch(inside.at, run.len() as u32);
                 continue;
             }
-            let p = p.map(|v| v.map(f64::from));
-            let mut found = 0;
-            let mut only = [0; 3];
-            triangle_cells(lattice, &p, &mut |at| {
-                found += 1;
-                only = at;
-                touch(at);
-            });
-            if found == 1 {
-                inside = Inside::new(lattice, only);
+            for p in run {
+                if inside.moves_to(lattice, &box_of(p)) {
+                    touch(inside.at, 1);
+                } else {
+                    triangle_cells(lattice, &p.map(|v| v.map(f64::from)), &mut |at| touch(at, 1));
+                }
             }
         }
-        for (center, radius) in primitives.spheres {
-            sphere_cells(lattice, center.map(f64::from), f64::from(*radius), &mut touch);
+        for (center, radius) in &primitives.spheres {
+            sphere_cells(lattice, center.map(f64::from), f64::from(*radius), &mut |at| touch(at, 1));
         }
     }
 
@@ -189,14 +212,27 @@ impl Inside {
         }
     }
 
+    /// Whether a box lies in one cell alone; if so, this is now that cell.
     #[inline]
-    pub(crate) fn holds(&self, p: &[[f32; 3]; 3]) -> bool {
+    pub(crate) fn moves_to(&mut self, lattice: &Lattice, bounds: &Box3) -> bool {
+        if self.holds(bounds) {
+            return true;
+        }
+        let at: [u32; 3] = std::array::from_fn(|a| lattice.number(a, f64::from(bounds[0][a])));
+        // one coordinate is enough to say no, and mostly says it
+        if (0..3).any(|a| lattice.number(a, f64::from(bounds[1][a])) != at[a]) {
+            return false;
+        }
+        *self = Inside::new(lattice, at);
+        true
+    }
+
+    #[inline]
+    fn holds(&self, bounds: &Box3) -> bool {
         // no branch per coordinate: the answer is nearly always the same
         let mut all = true;
-        for v in p {
-            for a in 0..3 {
-                all &= v[a] >= self.lo[a] && v[a] < self.hi[a];
-            }
+        for a in 0..3 {
+            all &= bounds[0][a] >= self.lo[a] && bounds[1][a] < self.hi[a];
         }
         all
     }
@@ -285,13 +321,47 @@ mod tests {
         let mut counter = Counter::new(lattice);
         let small = |x: f32| [[x, 0.1, 0.1], [x + 0.2, 0.1, 0.1], [x, 0.3, 0.1]];
         let first = [small(0.1), small(0.2), small(0.9)];
-        counter.add(0, Primitives { triangles: &first, spheres: &[] });
-        counter.add(1, Primitives { triangles: &[small(0.3)], spheres: &[([0.5, 0.5, 0.5], 0.25)] });
-        counter.add(1, Primitives { triangles: &[small(1.3)], spheres: &[] });
+        counter.add(0, &Primitives::new(&first, vec![]));
+        counter.add(1, &Primitives::new(&[small(0.3)], vec![([0.5, 0.5, 0.5], 0.25)]));
+        counter.add(1, &Primitives::new(&[small(1.3)], vec![]));
         let mut occupied: Vec<_> = counter.occupied().collect();
         occupied.sort();
         assert_eq!(occupied, [(0, 5, 2), (1, 2, 2)]);
         let sum = counter.summary();
         assert_eq!((sum.occupied, sum.fullest, sum.pairs, sum.contested_pairs), (2, 5, 7, 7));
+    }
+
+    /// The fast way (runs, and the cell of the triangle before) counts what the plain one does.
+    #[test]
+    fn runs_count_as_single_triangles_do() {
+        let mut state = 3u64;
+        let mut next = || {
+            state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+            // multiples of 1/16: on planes now and then
+            ((state >> 33) % 128) as f32 / 16.0
+        };
+        let mut triangles = Vec::new();
+        let mut at = [4.0f32; 3];
+        for i in 0..5000 {
+            if i % 40 == 0 {
+                at = [next(), next(), next()];
+            }
+            let mut corner =
+                || -> [f32; 3] { std::array::from_fn(|a| (at[a] + (next() - 4.0) / 16.0).clamp(0.0, 8.0)) };
+            triangles.push([corner(), corner(), corner()]);
+        }
+        for subdiv in [1, 2, 5, 8, 16] {
+            let lattice = Lattice::new(subdiv, [0.0; 3], [8.0; 3]).unwrap();
+            let mut fast = Counter::new(lattice.clone());
+            fast.add(7, &Primitives::new(&triangles, vec![]));
+            let mut plain = vec![0u32; lattice.len()];
+            for p in &triangles {
+                triangle_cells(&lattice, &p.map(|v| v.map(f64::from)), &mut |at| {
+                    plain[lattice.index(at) as usize] += 1
+                });
+            }
+            let counted: Vec<u32> = fast.cells.iter().map(|c| c.primitives).collect();
+            assert_eq!(counted, plain, "{subdiv}");
+        }
     }
 }

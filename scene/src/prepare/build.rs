@@ -7,8 +7,9 @@ use rayherd_render::bvh::{Fork, build_block};
 
 use super::PrepareError;
 use super::counting::CountingStore;
-use super::incidence::{CellBox, box_of};
+use super::incidence::CellBox;
 use super::records::{NORMALS, Records, UVS};
+use crate::grid::count::box_of;
 use crate::grid::lattice::{round_down, round_up};
 use crate::manifest::SplitEntry;
 use crate::objects::{ObjectKind, ObjectStore};
@@ -51,7 +52,7 @@ pub(crate) fn build_split(
     let attributes = store.put(ObjectKind::Attributes, &attributes(records).encode())?;
 
     let mut bounds = CellBox::EMPTY;
-    records.triangles.iter().for_each(|p| bounds.add(&box_of(p)));
+    bounds.add(&CellBox::from(box_of(records.triangles.as_flattened())));
     for s in &records.spheres {
         let end = |sign: f64| s.center.map(|c| f64::from(c) + sign * f64::from(s.radius));
         bounds.add(&CellBox { lo: end(-1.0).map(round_down), hi: end(1.0).map(round_up) });

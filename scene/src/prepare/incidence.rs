@@ -2,7 +2,7 @@
 
 use super::records::Records;
 use crate::grid::Lattice;
-use crate::grid::count::{Counter, Inside};
+use crate::grid::count::{Box3, Counter, Inside, RUN, box_of};
 use crate::grid::lattice::{round_down, round_up};
 use crate::grid::touch::{Bounds, sphere_cells, sphere_in_cell, triangle_cells, triangle_in_cell};
 
@@ -72,6 +72,10 @@ impl CellBox {
         }
     }
 
+    pub(crate) fn from([lo, hi]: Box3) -> CellBox {
+        CellBox { lo, hi }
+    }
+
     fn outwards((lo, hi): Bounds) -> CellBox {
         CellBox { lo: lo.map(round_down), hi: hi.map(round_up) }
     }
@@ -98,28 +102,38 @@ pub(crate) fn incidence(cells: &ChosenCells, groups: &[u32], records: &Records) 
     let magnitude = cells.lattice.magnitude();
     let mut touched = Vec::new();
     let mut inside = Inside::NOWHERE;
-    let mut inside_number = 0;
-    for (i, p) in records.triangles.iter().enumerate() {
-        touched.clear();
-        if inside.holds(p) {
-            touched.push(inside_number);
-            boxes[inside_number].add(&box_of(p));
-        } else {
-            let exact = p.map(|v| v.map(f64::from));
-            let mut only = [0; 3];
-            triangle_cells(&cells.lattice, &exact, &mut |at| {
-                only = at;
-                touched.push(cells.number(at));
-                if let Some(part) = triangle_in_cell(&exact, &cells.lattice.cell_box(at), magnitude) {
-                    boxes[cells.number(at)].add(&CellBox::outwards(part));
+    for (first, run) in (0u32..).step_by(RUN).zip(records.triangles.chunks(RUN)) {
+        let bounds = box_of(run.as_flattened());
+        if inside.moves_to(&cells.lattice, &bounds) {
+            let number = cells.number(inside.at);
+            boxes[number].add(&CellBox::from(bounds));
+            // a run is copied as its triangles are
+            if cells.contested[number] {
+                out.contested += run.len() as u64;
+                if let Some(&group) = groups.get(number) {
+                    out.triangles.extend((first..).take(run.len()).map(|i| (i, group)));
                 }
-            });
-            if let [number] = touched[..] {
-                inside = Inside::new(&cells.lattice, only);
-                inside_number = number;
             }
+            continue;
         }
-        out.contested += u64::from(copy(cells, groups, &touched, i as u32, &mut out.triangles));
+        for (i, p) in (first..).zip(run) {
+            touched.clear();
+            let bounds = box_of(p);
+            if inside.moves_to(&cells.lattice, &bounds) {
+                let number = cells.number(inside.at);
+                touched.push(number);
+                boxes[number].add(&CellBox::from(bounds));
+            } else {
+                let exact = p.map(|v| v.map(f64::from));
+                triangle_cells(&cells.lattice, &exact, &mut |at| {
+                    touched.push(cells.number(at));
+                    if let Some(part) = triangle_in_cell(&exact, &cells.lattice.cell_box(at), magnitude) {
+                        boxes[cells.number(at)].add(&CellBox::outwards(part));
+                    }
+                });
+            }
+            out.contested += u64::from(copy(cells, groups, &touched, i, &mut out.triangles));
+        }
     }
     for (i, s) in records.spheres.iter().enumerate() {
         touched.clear();
@@ -158,16 +172,4 @@ fn copy(cells: &ChosenCells, groups: &[u32], touched: &[usize], primitive: u32, 
         pairs.truncate(keep);
     }
     contested
-}
-
-/// Box of a triangle.
-pub(crate) fn box_of(p: &[[f32; 3]; 3]) -> CellBox {
-    let mut out = CellBox { lo: p[0], hi: p[0] };
-    for v in &p[1..] {
-        for a in 0..3 {
-            out.lo[a] = out.lo[a].min(v[a]);
-            out.hi[a] = out.hi[a].max(v[a]);
-        }
-    }
-    out
 }

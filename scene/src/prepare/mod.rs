@@ -304,9 +304,9 @@ fn choose_grid(
     }
     for (split, range) in (0..).zip(ranges) {
         let records = spool.range(range)?;
-        let spheres: Vec<_> = records.spheres.iter().map(|s| (s.center, s.radius)).collect();
-        let primitives = Primitives { triangles: &records.triangles, spheres: &spheres };
-        counters.par_iter_mut().for_each(|counter| counter.add(split, primitives));
+        let spheres = records.spheres.iter().map(|s| (s.center, s.radius)).collect();
+        let primitives = Primitives::new(&records.triangles, spheres);
+        counters.par_iter_mut().for_each(|counter| counter.add(split, &primitives));
         progress.advance(1);
     }
     let counted: Vec<_> = counters.iter().map(Counter::summary).collect();

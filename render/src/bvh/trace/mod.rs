@@ -81,8 +81,8 @@ impl Tracer {
     pub fn kernel(&self) -> Kernel {
         self.kernel
     }
-    /// Whether vector kernels trace batches in the order of the rays' origins; at first they don't. Changes no answer. Worth
-    /// it for scrambled batches in large forests only: see `bvh/order.rs`.
+    /// Whether batches are traced in the order of the rays' origins; at first they aren't. Changes no answer. Worth it for
+    /// scrambled batches in large forests only: see `bvh/order.rs`.
     pub fn set_sorting(&mut self, is_on: bool) {
         self.sorter = is_on.then(Sorter::default);
     }
@@ -129,7 +129,7 @@ impl Tracer {
     }
 
     fn run_part<const ANY: bool>(&mut self, forest: &Forest, rays: &[Ray], done: &mut impl FnMut(usize, &State)) {
-        let Tracer { kernel, counters, stack, .. } = self;
+        let Tracer { kernel, counters, stack, sorter, .. } = self;
         let mut of_spheres = Counters::default();
         // triangles first, then the spheres that are nearer
         let spheres = forest.sphere_root();
@@ -141,19 +141,20 @@ impl Tracer {
             }
             done(i, state);
         };
+        let order = match (sorter, forest.bounds()) {
+            (Some(sorter), Some(bounds)) => sorter.order(bounds, rays),
+            _ => &[],
+        };
         match kernel {
             #[cfg(target_arch = "x86_64")]
             Kernel::Avx2 | Kernel::Avx512 => {
-                let order = match (&mut self.sorter, forest.bounds()) {
-                    (Some(sorter), Some(bounds)) => sorter.order(bounds, rays),
-                    _ => &[],
-                };
                 let mut finish = |i: usize, state: &mut State| finish(i, state, stack);
                 wide::trace::<ANY>(*kernel, &mut self.lanes, forest, rays, order, &mut finish, counters);
             }
             _ => {
-                for (i, ray) in rays.iter().enumerate() {
-                    let mut state = State::new(ray, forest.largest());
+                for k in 0..rays.len() {
+                    let i = order.get(k).map_or(k, |&i| i as usize);
+                    let mut state = State::new(&rays[i], forest.largest());
                     scalar::triangles(forest, &mut state, ANY, stack, counters);
                     finish(i, &mut state, stack);
                 }

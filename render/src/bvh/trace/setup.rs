@@ -117,34 +117,43 @@ impl State {
         leaf: 0,
     };
 
-    /// Constants of a ray in a forest whose largest coordinate is `largest`.
+    /// State at the start of a ray in a forest whose largest coordinate is `largest`.
     #[inline(always)]
     pub fn new(ray: &Ray, largest: f32) -> State {
+        let mut state = State::NOTHING;
+        state.start(ray, largest);
+        state
+    }
+
+    /// Sets all but `top`, `current` and `ray` to the start of a ray; in place, since batches do it often.
+    #[inline(always)]
+    pub fn start(&mut self, ray: &Ray, largest: f32) {
         let o = Vec4::new(ray.o[0], ray.o[1], ray.o[2], 0.0);
         let d = Vec4::new(ray.d[0], ray.d[1], ray.d[2], 0.0);
         let (far, size) = (o.abs(), d.abs());
-        let steepest = max3(size);
-        let reach = max3(far);
-        // NaN makes a comparison false; a NaN that max3 drops is caught by the sum
-        let sane = (o + d).dot(Vec4::ONE).is_finite()
+        let (reach, steepest) = (far.max_element(), size.max_element());
+        // NaN makes every comparison false
+        let is_sane = far.cmple(Vec4::splat(MAX_COORDINATE)).all()
+            && size.cmple(Vec4::splat(DIRECTION_RANGE.1)).all()
             && steepest >= DIRECTION_RANGE.0
-            && steepest <= DIRECTION_RANGE.1
-            && reach <= MAX_COORDINATE
-            && !ray.tmin.is_nan()
-            && !ray.tmax.is_nan();
-        if !sane {
-            return State::NOTHING;
+            && !(ray.tmin.is_nan() || ray.tmax.is_nan());
+        if !is_sane {
+            *self = State { top: self.top, current: self.current, ray: self.ray, ..State::NOTHING };
+            return;
         }
 
-        let least = steepest * NO_DIRECTION;
-        let flat = size.cmplt(Vec4::splat(least));
         // a flat axis divides by the least component that is not flat, with the sign it has
-        let divisor = Vec4::select(flat, Vec4::splat(least).copysign(d), d);
-        let d = Vec4::select(flat, Vec4::ZERO, d);
-        let inverse = Vec4::ONE / divisor;
-        let pad = inverse.abs() * (reach.max(largest) * PAD);
+        let least = Vec4::splat(steepest * NO_DIRECTION);
+        let is_flat = size.cmplt(least);
+        let inverse = Vec4::ONE / Vec4::select(is_flat, least.copysign(d), d);
+        let d = Vec4::select(is_flat, Vec4::ZERO, d);
+        let pad = inverse.abs() * (if reach > largest { reach } else { largest } * PAD);
         let center = o * inverse;
         let negative = inverse.is_negative_bitmask();
+        self.inverse = inverse;
+        self.near = center + pad;
+        self.far = center - pad;
+        self.near_row = std::array::from_fn(|a| a as u32 * 64 + (negative >> a & 1) * 32);
 
         // axis of the largest component, the last of equal ones
         let s = size.to_array();
@@ -156,32 +165,18 @@ impl State {
             2
         };
         let (kx, ky) = (NEXT[kz], NEXT[NEXT[kz]]);
-        let (o, d, inverse_z) = (o.to_array(), d.to_array(), inverse.to_array()[kz]);
-        State {
-            inverse,
-            near: center + pad,
-            far: center - pad,
-            near_row: std::array::from_fn(|a| a as u32 * 64 + (negative >> a & 1) * 32),
-            top: 0,
-            origin: [o[kx], o[ky], o[kz], 0.0],
-            shear: [d[kx] * inverse_z, d[ky] * inverse_z, inverse_z, 0.0],
-            axes: [kx as u32, ky as u32, kz as u32],
-            // also turns -0 into 0: distances are compared by their bits
-            tmin: if ray.tmin > 0.0 { ray.tmin } else { 0.0 },
-            tmax: ray.tmax,
-            current: 0,
-            ray: 0,
-            prim: MISS,
-            uv: [0.0; 2],
-            leaf: 0,
-        }
+        let (d, inverse_z) = (d.to_array(), inverse.to_array()[kz]);
+        self.origin = [ray.o[kx], ray.o[ky], ray.o[kz], 0.0];
+        self.shear = [d[kx] * inverse_z, d[ky] * inverse_z, inverse_z, 0.0];
+        self.axes = [kx as u32, ky as u32, kz as u32];
+        // also turns -0 into 0: distances are compared by their bits
+        self.tmin = if ray.tmin > 0.0 { ray.tmin } else { 0.0 };
+        self.tmax = ray.tmax;
+        self.prim = MISS;
+        self.uv = [0.0; 2];
+        self.leaf = 0;
     }
 }
 
 /// The next axis in cyclic order.
 const NEXT: [usize; 3] = [1, 2, 0];
-
-fn max3(v: Vec4) -> f32 {
-    let a = v.to_array();
-    a[0].max(a[1]).max(a[2])
-}

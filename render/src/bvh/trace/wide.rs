@@ -158,12 +158,11 @@ unsafe fn rounds<I: InstructionSet, const ANY: bool, D: FnMut(usize, &mut State)
     let mut next = 0;
     let mut flying = 0;
 
-    let start = |i: usize| {
-        let mut state = State::new(&rays[i], largest);
+    let start = |i: usize, state: &mut State| {
+        state.start(&rays[i], largest);
         state.top = BASE as u32;
         state.current = root;
         state.ray = i as u32;
-        state
     };
 
     // SAFETY, for all that follows: lists have at most `flying` <= IN_FLIGHT entries, plus one that is written and not
@@ -174,7 +173,7 @@ unsafe fn rounds<I: InstructionSet, const ANY: bool, D: FnMut(usize, &mut State)
     // the arena; the arena has 512 readable bytes after the last record, more than a vector past a leaf.
     unsafe {
         while next < total && flying < IN_FLIGHT {
-            *states.add(flying) = start(number(next));
+            start(number(next), &mut *states.add(flying));
             *keys.add(flying * stride + BASE) = i32::MIN;
             *references.add(flying * stride + BASE) = DONE;
             *inner.add(flying) = flying as u8;
@@ -278,7 +277,7 @@ unsafe fn rounds<I: InstructionSet, const ANY: bool, D: FnMut(usize, &mut State)
                         let ahead = order[(next + IN_FLIGHT).min(total - 1)] as usize;
                         _mm_prefetch::<_MM_HINT_T0>(rays.as_ptr().wrapping_add(ahead).cast());
                     }
-                    *state = start(number(next));
+                    start(number(next), state);
                     next += 1;
                     *inner.add(inners) = lane as u8;
                     inners += 1;
