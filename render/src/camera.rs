@@ -56,9 +56,11 @@ impl Camera {
     /// Unit direction through the point (x, y) of the film, in pixels from its upper left corner.
     #[inline(always)]
     pub fn direction(&self, x: f64, y: f64) -> [f32; 3] {
-        let d: [f64; 3] = std::array::from_fn(|i| self.corner[i] + x * self.right[i] + y * self.down[i]);
+        // written out: closures over arrays become calls
+        let along = |i: usize| self.corner[i] + x * self.right[i] + y * self.down[i];
+        let d = [along(0), along(1), along(2)];
         let scale = 1.0 / (d[0] * d[0] + d[1] * d[1] + d[2] * d[2]).sqrt();
-        d.map(|c| (c * scale) as f32)
+        [(d[0] * scale) as f32, (d[1] * scale) as f32, (d[2] * scale) as f32]
     }
 }
 

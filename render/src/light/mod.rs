@@ -33,6 +33,7 @@ pub struct Lights {
     by_prim: Vec<(PrimId, u32)>,
     sky: Option<Vec3>,
     sky_probability: f32,
+    only_triangles: bool,
 }
 
 /// One primitive, or the sky.
@@ -115,7 +116,8 @@ impl Lights {
             start = end;
         }
         let sky_probability = sky.map_or(0.0, |_| sources.last().map_or(0.0, |s| s.probability));
-        Lights { sources, ends, by_prim, sky, sky_probability }
+        let only_triangles = !sources.is_empty() && sources.iter().all(|s| matches!(s.geometry, Geometry::Triangle(_)));
+        Lights { sources, ends, by_prim, sky, sky_probability, only_triangles }
     }
 
     /// Whether there is nothing to sample.
@@ -140,6 +142,23 @@ impl Lights {
             Geometry::Sky => (sphere::uniform(u), f32::INFINITY, sphere::UNIFORM_PDF),
         };
         Some(LightSample { d, tmax, radiance: source.emission, pdf: pdf * source.probability })
+    }
+
+    /// What a number chooses, for callers that sample many at once: the triangle, or `None` for another kind of source; radiance; probability.
+    #[inline(always)]
+    pub(crate) fn chosen(&self, choice: u32) -> Option<(Option<&TriangleLight>, Vec3, f32)> {
+        let source = &self.sources[self.choose(choice)?];
+        let triangle = match &source.geometry {
+            Geometry::Triangle(t) => Some(t),
+            _ => None,
+        };
+        Some((triangle, source.emission, source.probability))
+    }
+
+    /// Whether every source is a triangle.
+    #[inline(always)]
+    pub(crate) fn only_triangles(&self) -> bool {
+        self.only_triangles
     }
 
     /// Density of [`Lights::sample`], from `o`, in the direction `d` that met the front of primitive `prim` at distance `t`, where the cosine

@@ -7,14 +7,14 @@ use crate::math::gamma;
 /// A triangle, sampled uniformly by area.
 #[derive(Clone, Copy, Debug)]
 pub struct TriangleLight {
-    p0: Vec3,
-    e1: Vec3,
-    e2: Vec3,
+    pub(crate) p0: Vec3,
+    pub(crate) e1: Vec3,
+    pub(crate) e2: Vec3,
     /// Unit normal of the front; its cosine is taken with it.
-    normal: Vec3,
-    area: f32,
+    pub(crate) normal: Vec3,
+    pub(crate) area: f32,
     /// Bound of the error of a sampled point, as a length.
-    error: f32,
+    pub(crate) error: f32,
 }
 
 /// Error of a direction: what snapping and normalising turn it by, in radians (the former below 1e-7, the latter below gamma(3)).
@@ -47,21 +47,26 @@ impl TriangleLight {
     /// Direction from `o`, limit of the shadow ray, density in solid angle.
     #[inline(always)]
     pub(super) fn sample(&self, o: Vec3, u: [f32; 2]) -> Option<(Vec3, f32, f32)> {
+        let (d, tmax, pdf, ok) = self.sample_or_not(o, u);
+        ok.then_some((d, tmax, pdf))
+    }
+
+    /// The same without branches; the last says whether the rest counts.
+    #[inline(always)]
+    pub(crate) fn sample_or_not(&self, o: Vec3, u: [f32; 2]) -> (Vec3, f32, f32, bool) {
         let root = u[0].sqrt();
         let p = self.p0 + self.e1 * (root * (1.0 - u[1])) + self.e2 * (root * u[1]);
         let way = p - o;
         let distance2 = way.length_squared();
         let distance = distance2.sqrt();
-        let d = way / distance;
+        let d = way * (1.0 / distance);
         let cos = -d.dot(self.normal);
-        if !(cos > 0.0 && distance2.is_finite()) {
-            return None;
-        }
+        let ok = (cos > 0.0) & (distance2 < f32::INFINITY);
         // The ray meets the light's plane nearer than the point by at most (error of the points) / cos + (turn) x distance x tan; the
         // ray test's own error grows with the light's distance and size (see math::offset).
-        let origin_error = o.abs().max_element() * gamma(4);
+        let origin_error = o.x.abs().max(o.y.abs()).max(o.z.abs()) * gamma(4);
         let slack = (self.error + origin_error + distance * TURN) / cos + distance * gamma(24);
-        Some((d, (distance - slack).max(0.0), distance2 / (cos * self.area)))
+        (d, (distance - slack).max(0.0), distance2 / (cos * self.area), ok)
     }
 
     /// Density in solid angle of the direction that met the front at distance `t` and cosine `cos`.

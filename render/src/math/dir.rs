@@ -22,14 +22,15 @@ impl UnitDir {
     /// direction differs by less than 1e-7 rad, which is the rounding of its own floats.
     #[inline]
     pub fn encode(v: [f32; 3]) -> UnitDir {
-        let w = v.map(f64::from);
+        // written out: `map` on arrays is a call, which stops loops from becoming vector code
+        let w = [f64::from(v[0]), f64::from(v[1]), f64::from(v[2])];
         let scale = 1.5 - 0.5 * (w[0] * w[0] + w[1] * w[1] + w[2] * w[2]);
-        let m = v.map(f32::abs);
-        let first = m[0] >= m[1] && m[0] >= m[2];
-        let second = !first && m[1] >= m[2];
+        let m = [v[0].abs(), v[1].abs(), v[2].abs()];
+        let first = (m[0] >= m[1]) & (m[0] >= m[2]);
+        let second = !first & (m[1] >= m[2]);
         let (a, b, c) = (
             if first { w[1] } else { w[0] },
-            if first || second { w[2] } else { w[1] },
+            if first | second { w[2] } else { w[1] },
             if first {
                 v[0]
             } else if second {
@@ -54,11 +55,18 @@ impl UnitDir {
         let (da, db) = (f64::from(a), f64::from(b));
         let c = (1.0 - da * da - db * db).max(0.0).sqrt() as f32;
         let c = f32::from_bits(c.to_bits() | (y << 1 & 0x8000_0000));
-        match x >> 30 {
-            0 => [c, a, b],
-            1 => [a, c, b],
-            _ => [a, b, c],
-        }
+        let (first, second) = (x >> 30 == 0, x >> 30 == 1);
+        [
+            if first { c } else { a },
+            if second {
+                c
+            } else if first {
+                a
+            } else {
+                b
+            },
+            if first | second { b } else { c },
+        ]
     }
 
     /// The two words, for wire formats.

@@ -35,7 +35,8 @@ impl Position {
     #[inline(always)]
     pub fn on_triangle(p0: Vec3, e1: Vec3, e2: Vec3, u: f32, v: f32) -> Position {
         let (a, b) = (e1 * u, e2 * v);
-        let extent = e1.abs().max(e2.abs()).max_element();
+        let longest = |e: Vec3| e.x.abs().max(e.y.abs()).max(e.z.abs());
+        let extent = longest(e1).max(longest(e2));
         Position {
             p: p0 + (a + b),
             error: (a.abs() + b.abs()) * gamma(5) + p0.abs() * gamma(2),
@@ -71,7 +72,7 @@ pub fn offset_origin(at: &Position, n: Vec3) -> Vec3 {
         let bits = o.to_bits();
         let step = 1 - ((n.to_bits() ^ bits) >> 31 << 1) as i32;
         let moved = f32::from_bits(bits.wrapping_add_signed(step));
-        if o == 0.0 || n == 0.0 { o } else { moved }
+        if (o == 0.0) | (n == 0.0) { o } else { moved }
     };
     Vec3::new(away(at.p.x, n.x), away(at.p.y, n.y), away(at.p.z, n.z))
 }

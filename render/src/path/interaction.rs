@@ -7,6 +7,38 @@ use crate::math::{Basis, Position, gamma, offset_origin};
 use crate::ray::Hit;
 use crate::world::Primitive;
 
+/// A point on a triangle, without branches.
+pub(super) struct Flat {
+    pub position: Position,
+    front: Vec3,
+    /// Unit geometric normal on the side the ray came from.
+    pub normal: Vec3,
+    /// Whether the ray came from the front.
+    pub from_front: bool,
+    /// Whether the rest means anything: not for an area whose square underflows or overflows, nor for one seen exactly edge on.
+    pub sound: bool,
+}
+
+impl Flat {
+    #[inline(always)]
+    pub(super) fn new(p0: Vec3, p1: Vec3, p2: Vec3, u: f32, v: f32, d: Vec3) -> Flat {
+        let (e1, e2) = (p1 - p0, p2 - p0);
+        let n = e1.cross(e2);
+        let length2 = n.length_squared();
+        let front = n * (1.0 / length2.sqrt());
+        let cos = front.dot(d);
+        let from_front = cos < 0.0;
+        let side = if from_front { 1.0 } else { -1.0 };
+        Flat {
+            position: Position::on_triangle(p0, e1, e2, u, v),
+            front,
+            normal: front * side,
+            from_front,
+            sound: (length2 > f32::MIN_POSITIVE) & (length2 < f32::INFINITY) & (cos.abs() > 0.0),
+        }
+    }
+}
+
 /// A point on a surface, seen along a ray.
 pub(super) struct Interaction {
     position: Position,
@@ -25,15 +57,13 @@ impl Interaction {
     #[inline(always)]
     pub(super) fn new(o: Vec3, d: Vec3, hit: &Hit, surface: &Surface) -> Option<Interaction> {
         let (position, front) = match surface.geometry {
-            Primitive::Triangle([a, b, c]) => {
-                let p0 = Vec3::from(a);
-                let (e1, e2) = (Vec3::from(b) - p0, Vec3::from(c) - p0);
-                let n = e1.cross(e2);
-                let length2 = n.length_squared();
-                if !(length2 > f32::MIN_POSITIVE && length2 < f32::INFINITY) {
+            Primitive::Triangle(vertices) => {
+                let [p0, p1, p2] = vertices.map(Vec3::from);
+                let flat = Flat::new(p0, p1, p2, hit.u, hit.v, d);
+                if !flat.sound {
                     return Self::tiny(d, hit, surface);
                 }
-                (Position::on_triangle(p0, e1, e2, hit.u, hit.v), n * (1.0 / length2.sqrt()))
+                (flat.position, flat.front)
             }
             Primitive::Sphere { center, radius, flipped } => {
                 let center = Vec3::from(center);
@@ -73,6 +103,12 @@ impl Interaction {
             Some(normals) => interpolated(normals, hit, normal, d),
         };
         Some(Interaction { position, front, normal, shading, from_front })
+    }
+
+    /// Whether shading and geometric normal are one.
+    #[inline(always)]
+    pub(super) fn is_flat(&self) -> bool {
+        self.shading == self.normal
     }
 
     /// Origin of every ray that leaves on the side the ray came from.

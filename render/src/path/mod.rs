@@ -4,6 +4,8 @@
 //! throughput, and splitting at the first hit. What a ray becomes is a function of (frame, world, ray, hit) alone: neither the batch it is
 //! in nor its neighbours matter.
 
+mod block;
+mod diffuse;
 mod interaction;
 pub mod reference;
 mod shade;
@@ -131,6 +133,8 @@ pub struct Outcome {
     pub next: Vec<PathRay>,
     /// What happened.
     pub counters: Counters,
+    /// Memory that `shade` keeps between calls.
+    block: Option<Box<block::Block>>,
 }
 
 impl Outcome {
@@ -182,4 +186,14 @@ pub fn camera_ray(frame: &Frame, pixel: u32, sample: u32) -> PathRay {
         throughput: Vec3::ONE.to_array(),
         pdf: 0.0,
     }
+}
+
+/// Weight of the power heuristic (Veach 1997) for a sample of density `a` that the other technique gives with density `b`.
+#[inline(always)]
+fn power_heuristic(a: f32, b: f32) -> f32 {
+    // as a ratio of at most 1, so that no square overflows
+    let (small, large) = if a < b { (a, b) } else { (b, a) };
+    let r = small / large;
+    let r2 = r * r;
+    (if a < b { r2 } else { 1.0 }) / (1.0 + r2)
 }

@@ -11,6 +11,7 @@ use crate::light::Lights;
 use crate::material::{Bsdf, Distribution};
 use crate::math::UnitDir;
 use crate::path::reference::{self, Tracer};
+use crate::path::shade::shade_plain;
 use crate::path::{Context, Outcome, PathRay, camera_ray, shade};
 use crate::ray::{Hit, PathKey};
 use crate::testing::Rng;
@@ -76,11 +77,39 @@ fn estimators_agree() {
     close(mean, roulette, 0.006);
 }
 
-/// Every ray alone gives what the batch gives, in any order.
+/// The Cornell box with metal, a sphere that emits, a sky, and shading normals: everything that may be in one batch.
+fn motley() -> Scene {
+    let mut scene = cornell::scene();
+    let bsdf = Bsdf::RoughConductor {
+        distribution: Distribution::Ggx,
+        alpha: [0.3, 0.1],
+        eta: [0.2, 0.4, 1.4],
+        k: [3.0, 2.4, 1.6],
+        specular: [1.0; 3],
+    };
+    let count = scene.shapes.len();
+    scene.shapes[count - 2].material = scene.material(bsdf, true);
+    let mirror = Bsdf::Conductor { eta: [0.2; 3], k: [3.0; 3], specular: [1.0; 3] };
+    scene.shapes[count - 3].material = scene.material(mirror, true);
+    let white = scene.diffuse(0.8);
+    let lamp = scene.shape(white, Some([2.0; 3]));
+    scene.sphere(lamp, [0.5, 0.2, 0.3], 0.1, false);
+    scene.environment = Some([0.3; 3]);
+    let n = scene.normals.len();
+    scene.normals[n / 2] = Some([[0.1, 0.2, 1.0]; 3]);
+    scene
+}
+
+/// Every ray alone, and the plain way, gives what the batch gives; also in another order.
 #[test]
 fn batches_do_not_matter() {
-    let scene = cornell::scene();
-    let frame = Frame { split: 3, ..cornell::frame(16) };
+    for (scene, split) in [(cornell::scene(), 1), (motley(), 3)] {
+        check_batches(&scene, split);
+    }
+}
+
+fn check_batches(scene: &Scene, split: u32) {
+    let frame = Frame { split, ..cornell::frame(16) };
     let world = scene.world();
     let lights = Lights::new(&world);
     let context = Context { world: &world, lights: &lights, frame: &frame };
@@ -88,12 +117,15 @@ fn batches_do_not_matter() {
     for _ in 0..4 {
         let hits: Vec<Hit> = rays.iter().map(|r| scene.closest(&r.ray())).collect();
         let mut whole = Outcome::default();
-        shade(&context, &scene, &rays, &hits, &mut whole);
+        shade(&context, scene, &rays, &hits, &mut whole);
         let mut parts = Outcome::default();
+        shade_plain(&context, scene, &rays, &hits, &mut parts);
+        assert_eq!((&parts.light, &parts.shadow, &parts.next), (&whole.light, &whole.shadow, &whole.next));
+        assert_eq!(parts.counters, whole.counters);
         for size in [1, 2, 3, 7, 16, 100] {
             parts.clear();
             for (r, h) in rays.chunks(size).zip(hits.chunks(size)) {
-                shade(&context, &scene, r, h, &mut parts);
+                shade(&context, scene, r, h, &mut parts);
             }
             assert_eq!((&parts.light, &parts.shadow, &parts.next), (&whole.light, &whole.shadow, &whole.next));
         }
@@ -101,7 +133,7 @@ fn batches_do_not_matter() {
         r.reverse();
         h.reverse();
         parts.clear();
-        shade(&context, &scene, &r, &h, &mut parts);
+        shade(&context, scene, &r, &h, &mut parts);
         let sorted = |o: &Outcome| {
             let mut bytes: Vec<Vec<u8>> = o.next.iter().map(|x| bytemuck::bytes_of(x).to_vec()).collect();
             bytes.extend(o.shadow.iter().map(|x| bytemuck::bytes_of(x).to_vec()));
