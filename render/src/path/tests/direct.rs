@@ -104,3 +104,36 @@ fn metal_under_the_sky() {
         assert!((found / expected - 1.0).abs() < 0.002, "{distribution:?}: {found} {expected}");
     }
 }
+
+/// Where camera rays, as they travel, pass the film: about the pixel's centre, distributed as the filter.
+#[test]
+fn camera_rays_follow_the_filter() {
+    use crate::filter::Filter;
+    use crate::path::camera_ray;
+    for filter in [Filter::Box, Filter::Tent { radius: 1.0 }, Filter::Gaussian { stddev: 0.5 }] {
+        let size = [250, 250];
+        let mut frame = frame([1.0, 2.0, 3.0], 60.0, size, 1);
+        frame.filter = filter;
+        // x of the film from the direction: corner + x right + y down, z of which is 1
+        let half = libm::tan(30.0f64.to_radians());
+        let (bins, reach) = (12, 1.5);
+        let mut counts = vec![0.0; bins * bins];
+        let n = size[0] * size[1];
+        for pixel in 0..n {
+            let d = camera_ray(&frame, pixel, 3).dir.decode().map(f64::from);
+            let film = |c: f64| 125.0 * (1.0 - c / d[2] / half);
+            let offset = [film(d[0]) - f64::from(pixel % 250) - 0.5, film(d[1]) - f64::from(pixel / 250) - 0.5];
+            let bin = offset.map(|o| ((o + reach) / (2.0 * reach) * bins as f64).floor());
+            if bin.iter().all(|b| (0.0..bins as f64).contains(b)) {
+                counts[bin[1] as usize * bins + bin[0] as usize] += 1.0;
+            }
+        }
+        let width = 2.0 * reach / bins as f64;
+        let share = |b: usize| {
+            let midpoint = |k: usize| -reach + width * (b as f64 + (k as f64 + 0.5) / 64.0);
+            (0..64).map(|k| filter.density(midpoint(k))).sum::<f64>() * width / 64.0
+        };
+        let expected: Vec<f64> = (0..bins * bins).map(|i| f64::from(n) * share(i / bins) * share(i % bins)).collect();
+        crate::testing::chi_square(&counts, &expected);
+    }
+}
