@@ -3,6 +3,7 @@
 use std::io;
 
 use rayherd_herd::job::JobError;
+use rayherd_herd::store::StoreError;
 use rayherd_scene::ImportError;
 use rayherd_scene::manifest::ManifestError;
 use rayherd_scene::objects::ObjectError;
@@ -34,6 +35,14 @@ fn is_users(cause: &(dyn std::error::Error + 'static)) -> bool {
             PrepareError::Inconsistent(_) | PrepareError::Spool { .. } => false,
         })
         || cause.downcast_ref().is_some_and(JobError::is_users)
+        || cause.downcast_ref().is_some_and(|e| match e {
+            StoreError::Unavailable { .. } | StoreError::Full { .. } => false,
+            StoreError::NotFound { .. }
+            | StoreError::Denied { .. }
+            | StoreError::Corrupt { .. }
+            | StoreError::InvalidKey { .. }
+            | StoreError::Misconfigured { .. } => true,
+        })
         || cause.downcast_ref().is_some_and(|e| match e {
             ToolError::Import(e) => import_is_users(e),
             ToolError::Write { source, .. } => is_wrong_path(source),

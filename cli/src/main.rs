@@ -12,6 +12,7 @@ mod progress;
 mod run_options;
 mod source;
 mod spilling;
+mod store;
 
 use std::process::ExitCode;
 

@@ -1,12 +1,10 @@
 //! From a job to its prepared scene: what `render`, `prepare` and `replay` begin with.
 
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
 
 use anyhow::Context;
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use rayherd_api::{RenderJobSpec, Strategy};
-use rayherd_scene::description::Description;
 use rayherd_scene::import::{DescriptionSource, StreamOptions, import};
 use rayherd_scene::objects::ObjectStore;
 use rayherd_scene::prepare::{Cut, PrepareProgress, PrepareSettings, Prepared, SpoolSettings, Stage, prepare};
@@ -15,15 +13,14 @@ use crate::log::bars;
 use crate::options::import_options;
 
 /// Imports and prepares the scene of a job that was checked.
-pub fn open(spec: &RenderJobSpec, objects: &Arc<dyn ObjectStore>) -> anyhow::Result<(Description, Prepared)> {
+pub fn open(spec: &RenderJobSpec, objects: &dyn ObjectStore) -> anyhow::Result<Prepared> {
     let description = import(Path::new(&spec.scene.source), &import_options(spec))?;
     let source = DescriptionSource::new(&description, StreamOptions::default());
     let progress = StageBar::new();
     let prepared =
-        prepare(&description, &source, &prepare_settings(spec), &SpoolSettings::default(), objects.as_ref(), &progress);
+        prepare(&description, &source, &prepare_settings(spec), &SpoolSettings::default(), objects, &progress);
     progress.finish();
-    let prepared = prepared.with_context(|| format!("cannot prepare {}", spec.scene.source))?;
-    Ok((description, prepared))
+    prepared.with_context(|| format!("cannot prepare {}", spec.scene.source))
 }
 
 /// What preparing is told.

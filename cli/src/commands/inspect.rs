@@ -8,11 +8,12 @@ use anyhow::Context;
 use clap::Args;
 use rayherd_scene::inspect::{Picture, picture, summary};
 use rayherd_scene::manifest::Manifest;
-use rayherd_scene::objects::{DirectoryObjects, ObjectRef, ObjectStore};
+use rayherd_scene::objects::ObjectRef;
 
 use super::{print, size};
 use crate::fault::Mistake;
 use crate::output::{png_file, replace};
+use crate::store::{S3Options, Store};
 
 /// Show what a prepared scene is made of: splits, cells, owners, copies, sizes
 #[derive(Args)]
@@ -23,8 +24,10 @@ use crate::output::{png_file, replace};
     Examples:\n  rayherd inspect prepared\n  rayherd inspect prepared --splits --picture grid.png"
 )]
 pub struct Arguments {
-    /// A folder that `rayherd prepare` filled
-    prepared: PathBuf,
+    /// What `rayherd prepare` filled: a folder, or s3://bucket/prefix
+    prepared: String,
+    #[command(flatten)]
+    s3: S3Options,
     /// Which scene, by the first digits of its hash, when the folder holds several
     #[arg(long, value_name = "HASH")]
     scene: Option<String>,
@@ -38,7 +41,7 @@ pub struct Arguments {
 
 /// Reads the manifest and prints.
 pub fn run(arguments: &Arguments) -> anyhow::Result<ExitCode> {
-    let (object, manifest) = choose(&arguments.prepared, arguments.scene.as_deref())?;
+    let (object, manifest) = choose(&arguments.prepared, &arguments.s3, arguments.scene.as_deref())?;
     let mut text = format!("scene        {}\n{}", object.hash, summary(&manifest));
     if arguments.splits {
         text += &split_table(&manifest);
@@ -54,13 +57,14 @@ pub fn run(arguments: &Arguments) -> anyhow::Result<ExitCode> {
 }
 
 /// The one scene of a folder, or the one whose hash begins with `wanted`.
-fn choose(folder: &Path, wanted: Option<&str>) -> anyhow::Result<(ObjectRef, Manifest)> {
-    let shown = folder.display();
-    if !folder.join("names").is_dir() {
-        let message = format!("{shown} holds no prepared scene: make one with `rayherd prepare SCENE --store {shown}`");
-        return Err(Mistake(message).into());
+fn choose(shown: &str, s3: &S3Options, wanted: Option<&str>) -> anyhow::Result<(ObjectRef, Manifest)> {
+    let none =
+        || Mistake(format!("{shown} holds no prepared scene: make one with `rayherd prepare SCENE --store {shown}`"));
+    // a folder that is no store must not become one by looking
+    if !shown.starts_with("s3://") && !Path::new(shown).join("names").is_dir() {
+        return Err(none().into());
     }
-    let store = DirectoryObjects::open(folder)?;
+    let store = Store::existing(shown, s3)?.objects;
     let mut scenes: Vec<ObjectRef> = Vec::new();
     for name in store.names()?.iter().filter(|n| n.starts_with("scene-")) {
         let object = store.name(name)?.with_context(|| format!("{shown}: name {name} has gone"))?;
@@ -70,13 +74,15 @@ fn choose(folder: &Path, wanted: Option<&str>) -> anyhow::Result<(ObjectRef, Man
     }
     match scenes[..] {
         [object] => {
-            let manifest = Manifest::load(&store, &object).with_context(|| format!("{shown}: {}", object.hash))?;
+            let manifest =
+                Manifest::load(store.as_ref(), &object).with_context(|| format!("{shown}: {}", object.hash))?;
             Ok((object, manifest))
         }
-        [] => {
-            let which = wanted.map(|w| format!(" whose hash begins with {w}")).unwrap_or_default();
-            Err(Mistake(format!("{shown} holds no prepared scene{which}")).into())
+        [] => Err(match wanted {
+            Some(w) => Mistake(format!("{shown} holds no prepared scene whose hash begins with {w}")),
+            None => none(),
         }
+        .into()),
         _ => {
             let list: Vec<String> = scenes.iter().map(|s| format!("\n  {}", s.hash)).collect();
             Err(Mistake(format!("{shown} holds {} scenes, choose one with --scene:{}", list.len(), list.concat()))

@@ -1,6 +1,7 @@
 //! The commands, one a file.
 
 mod compare;
+mod gc;
 mod inspect;
 mod prepare;
 mod render;
@@ -18,6 +19,7 @@ pub enum Command {
     Prepare(prepare::Arguments),
     Inspect(inspect::Arguments),
     Compare(compare::Arguments),
+    Gc(gc::Arguments),
     Scene(scene::Arguments),
 }
 
@@ -26,6 +28,7 @@ pub fn run(command: Command) -> anyhow::Result<ExitCode> {
     match command {
         Command::Render(arguments) => render::run(&arguments),
         Command::Compare(arguments) => compare::run(&arguments),
+        Command::Gc(arguments) => gc::run(&arguments),
         Command::Scene(arguments) => scene::run(&arguments),
         Command::Inspect(arguments) => inspect::run(&arguments),
         Command::Prepare(arguments) => prepare::run(&arguments),

@@ -1,16 +1,14 @@
 //! `rayherd prepare`: a scene made ready once, for many renders.
 
-use std::path::PathBuf;
 use std::process::ExitCode;
-use std::sync::Arc;
 
 use clap::Args;
 use rayherd_api::{ImageSize, RenderJob, RenderJobSpec, Strategy};
-use rayherd_scene::objects::{DirectoryObjects, ObjectStore};
 
 use super::{print, size};
 use crate::options::{self, CutOptions, SceneOptions};
 use crate::source;
+use crate::store::{S3Options, Store};
 
 /// Cut a scene into splits, build their trees and the scheduling grid, and store them
 ///
@@ -21,9 +19,11 @@ use crate::source;
 pub struct Arguments {
     /// Mitsuba XML, mesh (PLY, OBJ, STL), folder of meshes, or CT volume (DICOM folder, NRRD, NIfTI)
     scene: String,
-    /// Folder to store it in
-    #[arg(long, value_name = "DIR")]
-    store: PathBuf,
+    /// Where to store it: a folder, or s3://bucket/prefix
+    #[arg(long, value_name = "STORE")]
+    store: String,
+    #[command(flatten)]
+    s3: S3Options,
     #[command(flatten)]
     scene_options: SceneOptions,
     #[command(flatten)]
@@ -45,8 +45,8 @@ pub fn run(arguments: &Arguments) -> anyhow::Result<ExitCode> {
     arguments.cut.apply(&mut spec);
     options::check(&RenderJob::new(spec.clone()), None)?;
 
-    let objects: Arc<dyn ObjectStore> = Arc::new(DirectoryObjects::open(&arguments.store)?);
-    let (_, prepared) = source::open(&spec, &objects)?;
+    let store = Store::open(&arguments.store, &arguments.s3)?;
+    let prepared = source::open(&spec, store.objects.as_ref())?;
     let m = &prepared.manifest;
     let copied = m.splits.iter().filter(|s| s.copied).count();
     let done = if prepared.reused { "was prepared already: nothing to do" } else { "is prepared" };
@@ -58,7 +58,7 @@ pub fn run(arguments: &Arguments) -> anyhow::Result<ExitCode> {
         size(m.scene_bytes()),
         m.grid.subdiv,
         prepared.reference.hash,
-        arguments.store.display()
+        arguments.store
     ))?;
     Ok(ExitCode::SUCCESS)
 }

@@ -8,7 +8,7 @@ use std::sync::Arc;
 use anyhow::Context;
 use clap::Args;
 use rayherd_api::{RenderJob, RenderJobSpec};
-use rayherd_herd::job::{JobSettings, PreparedScene, Sampling};
+use rayherd_herd::job::{Commits, JobSettings, PreparedScene, Sampling};
 use rayherd_herd::local::{JobOutcome, render_local};
 use rayherd_herd::report::Report;
 use rayherd_scene::objects::ObjectStore;
@@ -25,6 +25,7 @@ use crate::progress::{Display, si};
 use crate::run_options::RunOptions;
 use crate::source;
 use crate::spilling::SpillingObjects;
+use crate::store::{S3Options, Store};
 
 /// Objects of the prepared scene that stay in memory; what is more goes to a temporary folder.
 const OBJECTS_IN_MEMORY: u64 = 256 << 20;
@@ -38,7 +39,8 @@ const OBJECTS_IN_MEMORY: u64 = 256 << 20;
     rayherd render bunny.ply -o bunny.exr --spp 256 --albedo 0.8,0.6,0.4\n  \
     rayherd render chest-ct --iso -789.5 --size 512x512 --target-error 0.01\n  \
     rayherd render scene.xml --nodes 4 --slots 2,2,4,4 --memory 64Mi --splits 32 --report r.json\n  \
-    rayherd render -f job.yaml")]
+    rayherd render -f job.yaml\n  \
+    rayherd render scene.xml --spp 4096 --store results --resume")]
 pub struct Arguments {
     /// Mitsuba XML, mesh (PLY, OBJ, STL), folder of meshes, or CT volume (DICOM folder, NRRD, NIfTI)
     #[arg(required_unless_present = "file")]
@@ -68,6 +70,25 @@ pub struct Arguments {
     cut: CutOptions,
     #[command(flatten)]
     run: RunOptions,
+    #[command(flatten)]
+    keep: KeepOptions,
+}
+
+/// Where the job is kept.
+#[derive(Args)]
+#[command(next_help_heading = "Keeping")]
+struct KeepOptions {
+    /// Keep the prepared scene and every committed task here, a folder or s3://bucket/prefix, to go on after a crash
+    #[arg(long, value_name = "STORE")]
+    store: Option<String>,
+    /// Go on where the store's job stopped: after a crash, or with more samples
+    #[arg(long, requires = "store")]
+    resume: bool,
+    /// Take the store from whoever writes to it
+    #[arg(long, requires = "store")]
+    takeover: bool,
+    #[command(flatten)]
+    s3: S3Options,
 }
 
 /// How many samples.
@@ -96,8 +117,13 @@ pub fn run(arguments: &Arguments) -> anyhow::Result<ExitCode> {
         replace::probe(&path)?;
     }
 
-    let objects: Arc<dyn ObjectStore> = Arc::new(SpillingObjects::new(OBJECTS_IN_MEMORY));
-    let (_, prepared) = source::open(&job.spec, &objects)?;
+    let keep = &arguments.keep;
+    let store = keep.store.as_ref().map(|address| Store::open(address, &keep.s3)).transpose()?;
+    let objects: Arc<dyn ObjectStore> = match &store {
+        Some(store) => store.objects.clone(),
+        None => Arc::new(SpillingObjects::new(OBJECTS_IN_MEMORY)),
+    };
+    let prepared = source::open(&job.spec, objects.as_ref())?;
     let shots = frames::shots(&job, &prepared.manifest)?;
     let scene = PreparedScene::open(prepared.manifest.clone(), objects)?;
     let sampling = Sampling {
@@ -109,6 +135,9 @@ pub fn run(arguments: &Arguments) -> anyhow::Result<ExitCode> {
     let mut reports = Vec::new();
     for shot in &shots {
         let preview = arguments.preview.clone().unwrap_or_else(|| shot.png());
+        let store = store.as_ref().map(|store| store.job(&prepared, &shot.frame)).transpose()?;
+        let commits = store.map(|store| Commits { store, resume: keep.resume, takeover: keep.takeover });
+        let settings = JobSettings { commits, ..settings.clone() };
         let mut outcome = render(&scene, shot, &sampling, &settings, (preview, exposure))?;
         outcome.report.prepare = prepare_report(&prepared);
         save(&scene, shot, &outcome, exposure)?;

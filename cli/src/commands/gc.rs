@@ -1,0 +1,76 @@
+//! `rayherd gc`: deletes what nothing names.
+
+use std::collections::BTreeSet;
+use std::process::ExitCode;
+
+use anyhow::Context;
+use clap::Args;
+use rayherd_herd::local::{Collected, collect};
+use rayherd_herd::store::object_key;
+use rayherd_scene::manifest::Manifest;
+
+use super::{print, size};
+use crate::store::{JOBS, S3Options, Store};
+
+/// Delete what nothing in a store names: losing attempts, consumed rays, objects of no scene
+///
+/// A job that is being written is refused. Do not prepare a scene into the store at the same time: its objects have no
+/// name until it is complete.
+#[derive(Args)]
+#[command(
+    after_help = "Examples:\n  rayherd gc results\n  rayherd gc s3://bucket/renders --s3-endpoint http://localhost:9000"
+)]
+pub struct Arguments {
+    /// A folder, or s3://bucket/prefix
+    store: String,
+    #[command(flatten)]
+    s3: S3Options,
+}
+
+/// Collects jobs first, then objects.
+pub fn run(arguments: &Arguments) -> anyhow::Result<ExitCode> {
+    let store = Store::existing(&arguments.store, &arguments.s3)?;
+    let mut total = Collected::default();
+    for job in jobs(&store)? {
+        let done = store.wait(collect(store.part(&job)?.as_ref())).with_context(|| format!("cannot collect {job}"))?;
+        total.objects += done.objects;
+        total.bytes += done.bytes;
+        total.kept += done.kept;
+    }
+    let named = named(&store)?;
+    let mut garbage = Vec::new();
+    for (key, bytes) in store.wait(store.blocks.list("objects/"))? {
+        if named.contains(&key) {
+            total.kept += 1;
+        } else {
+            total.objects += 1;
+            total.bytes += bytes;
+            garbage.push(key);
+        }
+    }
+    store.wait(store.blocks.delete(&garbage))?;
+    let Collected { objects, bytes, kept } = total;
+    print(&format!("{}: {objects} objects deleted, {}; {kept} kept\n", arguments.store, size(bytes)))?;
+    Ok(ExitCode::SUCCESS)
+}
+
+/// Prefixes of the jobs.
+fn jobs(store: &Store) -> anyhow::Result<BTreeSet<String>> {
+    let keys = store.wait(store.blocks.list(JOBS))?;
+    let job = |key: &str| key[JOBS.len()..].split_once('/').map(|(job, _)| format!("{JOBS}{job}"));
+    Ok(keys.iter().filter_map(|(key, _)| job(key)).collect())
+}
+
+/// Keys of all objects that belong to a prepared scene with a name.
+fn named(store: &Store) -> anyhow::Result<BTreeSet<String>> {
+    let mut keys = BTreeSet::new();
+    for name in store.objects.names()? {
+        let Some(object) = store.objects.name(&name)? else { continue };
+        keys.insert(object_key(&object.hash));
+        // one that cannot be read must not cost the objects of which it is the only list
+        let manifest = Manifest::load(store.objects.as_ref(), &object);
+        let manifest = manifest.with_context(|| format!("{name}: delete this name to give the scene up"))?;
+        keys.extend(manifest.objects().map(|o| object_key(&o.hash)));
+    }
+    Ok(keys)
+}
