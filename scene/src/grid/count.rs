@@ -48,8 +48,9 @@ const MOST_CELLS: usize = 24 << 20;
 #[derive(Clone, Debug)]
 pub struct Primitives<'a> {
     triangles: &'a [[[f32; 3]; 3]],
-    /// Box of every [`RUN`] triangles.
-    runs: Vec<Box3>,
+    places: Vec<Place>,
+    /// Of every [`RUN`] triangles.
+    runs: Vec<Place>,
     /// Centre and radius.
     spheres: Vec<([f32; 3], f32)>,
 }
@@ -57,15 +58,47 @@ pub struct Primitives<'a> {
 /// Lower and upper corner.
 pub(crate) type Box3 = [[f32; 3]; 2];
 
-/// Triangles that are looked at together first: neighbours in the file are neighbours in space.
+/// Triangles that are looked at together first: neighbours in the file are often neighbours in space.
 pub(crate) const RUN: usize = 16;
 
+/// A box as fractions of the scene's, in units of 2^-32, rounded outwards by so much that a plane of any candidate that
+/// touches the box lies strictly between its corners, or at one of them.
+type Place = [[u32; 3]; 2];
+
 impl<'a> Primitives<'a> {
-    /// From vertices, and centres and radii.
-    pub fn new(triangles: &'a [[[f32; 3]; 3]], spheres: Vec<([f32; 3], f32)>) -> Self {
-        let runs = triangles.chunks(RUN).map(|run| box_of(run.as_flattened())).collect();
-        Primitives { triangles, runs, spheres }
+    /// From vertices, and centres and radii; `lattice` has the scene's box (its subdivision does not matter).
+    pub fn new(lattice: &Lattice, triangles: &'a [[[f32; 3]; 3]], spheres: Vec<([f32; 3], f32)>) -> Self {
+        let (lo, hi) = lattice.bounds();
+        let units = (1u64 << 32) as f64;
+        let scale: [f64; 3] = std::array::from_fn(|a| if hi[a] > lo[a] { units / (hi[a] - lo[a]) } else { 0.0 });
+        // a coordinate's fraction is rounded by 4 u, a plane by 3 u M in position: in units of 2^-32 of the box, below
+        // 2^-18 and 2^-18 M / extent; and one for the cast
+        let m = lattice.magnitude();
+        let margin: [f64; 3] = std::array::from_fn(|a| 2.0 + (m * scale[a] * 1e-15).ceil());
+        let place = |[low, high]: Box3| -> Place {
+            // casts saturate: what is outside stays at the box's faces
+            let from = |x: f32, a: usize| (f64::from(x) - lo[a]) * scale[a];
+            [
+                std::array::from_fn(|a| (from(low[a], a) - margin[a]) as u32),
+                std::array::from_fn(|a| (from(high[a], a) + margin[a]) as u32),
+            ]
+        };
+        Primitives {
+            triangles,
+            places: triangles.iter().map(|p| place(box_of(p))).collect(),
+            runs: triangles.chunks(RUN).map(|run| place(box_of(run.as_flattened()))).collect(),
+            spheres,
+        }
     }
+}
+
+/// The cell of a lattice that a box lies in for certain, if there is one: an integer product for each face instead of
+/// a division, and no plane is computed.
+#[inline]
+fn certain_cell(subdiv: u32, [low, high]: &Place) -> Option<[u32; 3]> {
+    let cell = |q: u32| (u64::from(q) * u64::from(subdiv) >> 32) as u32;
+    let at = low.map(cell);
+    (at == high.map(cell)).then_some(at)
 }
 
 /// Box of points.
@@ -150,17 +183,17 @@ impl Counter {
                 cell.owners += 1;
             }
         };
-        let mut inside = Inside::NOWHERE;
-        for (run, bounds) in primitives.triangles.chunks(RUN).zip(&primitives.runs) {
-            if inside.moves_to(lattice, bounds) {
-                touch(inside.at, run.len() as u32);
+        let n = lattice.subdiv();
+        let runs = primitives.triangles.chunks(RUN).zip(primitives.places.chunks(RUN)).zip(&primitives.runs);
+        for ((run, places), together) in runs {
+            if let Some(at) = certain_cell(n, together) {
+                touch(at, run.len() as u32);
                 continue;
             }
-            for p in run {
-                if inside.moves_to(lattice, &box_of(p)) {
-                    touch(inside.at, 1);
-                } else {
-                    triangle_cells(lattice, &p.map(|v| v.map(f64::from)), &mut |at| touch(at, 1));
+            for (p, place) in run.iter().zip(places) {
+                match certain_cell(n, place) {
+                    Some(at) => touch(at, 1),
+                    None => triangle_cells(lattice, &p.map(|v| v.map(f64::from)), &mut |at| touch(at, 1)),
                 }
             }
         }
@@ -188,53 +221,6 @@ impl Counter {
     /// Occupied cells by ascending index: index, primitives, number of owners.
     pub fn occupied(&self) -> impl Iterator<Item = (u32, u32, u32)> + '_ {
         (0..).zip(&self.cells).filter(|(_, c)| c.primitives > 0).map(|(i, c)| (i, c.primitives, c.owners))
-    }
-}
-
-/// A cell's box in f32, rounded inwards, half open as cells are: what is strictly inside lies in this cell alone.
-#[derive(Clone, Copy, Debug)]
-pub(crate) struct Inside {
-    pub(crate) at: [u32; 3],
-    lo: [f32; 3],
-    hi: [f32; 3],
-}
-
-impl Inside {
-    /// Holds nothing.
-    pub(crate) const NOWHERE: Inside = Inside { at: [0; 3], lo: [f32::INFINITY; 3], hi: [f32::NEG_INFINITY; 3] };
-
-    pub(crate) fn new(lattice: &Lattice, at: [u32; 3]) -> Self {
-        let (lo, hi) = lattice.cell_box(at);
-        Inside {
-            at,
-            lo: std::array::from_fn(|a| super::lattice::round_up(lo[a])),
-            hi: std::array::from_fn(|a| super::lattice::round_down(hi[a])),
-        }
-    }
-
-    /// Whether a box lies in one cell alone; if so, this is now that cell.
-    #[inline]
-    pub(crate) fn moves_to(&mut self, lattice: &Lattice, bounds: &Box3) -> bool {
-        if self.holds(bounds) {
-            return true;
-        }
-        let at: [u32; 3] = std::array::from_fn(|a| lattice.number(a, f64::from(bounds[0][a])));
-        // one coordinate is enough to say no, and mostly says it
-        if (0..3).any(|a| lattice.number(a, f64::from(bounds[1][a])) != at[a]) {
-            return false;
-        }
-        *self = Inside::new(lattice, at);
-        true
-    }
-
-    #[inline]
-    fn holds(&self, bounds: &Box3) -> bool {
-        // no branch per coordinate: the answer is nearly always the same
-        let mut all = true;
-        for a in 0..3 {
-            all &= bounds[0][a] >= self.lo[a] && bounds[1][a] < self.hi[a];
-        }
-        all
     }
 }
 
@@ -321,9 +307,12 @@ mod tests {
         let mut counter = Counter::new(lattice);
         let small = |x: f32| [[x, 0.1, 0.1], [x + 0.2, 0.1, 0.1], [x, 0.3, 0.1]];
         let first = [small(0.1), small(0.2), small(0.9)];
-        counter.add(0, &Primitives::new(&first, vec![]));
-        counter.add(1, &Primitives::new(&[small(0.3)], vec![([0.5, 0.5, 0.5], 0.25)]));
-        counter.add(1, &Primitives::new(&[small(1.3)], vec![]));
+        counter.add(0, &Primitives::new(&counter.lattice().clone(), &first, vec![]));
+        let second = [small(0.3)];
+        let spheres = vec![([0.5, 0.5, 0.5], 0.25)];
+        counter.add(1, &Primitives::new(&counter.lattice().clone(), &second, spheres));
+        let third = [small(1.3)];
+        counter.add(1, &Primitives::new(&counter.lattice().clone(), &third, vec![]));
         let mut occupied: Vec<_> = counter.occupied().collect();
         occupied.sort();
         assert_eq!(occupied, [(0, 5, 2), (1, 2, 2)]);
@@ -331,7 +320,7 @@ mod tests {
         assert_eq!((sum.occupied, sum.fullest, sum.pairs, sum.contested_pairs), (2, 5, 7, 7));
     }
 
-    /// The fast way (runs, and the cell of the triangle before) counts what the plain one does.
+    /// The fast way (runs, then boxes, in integers) counts what the plain one does.
     #[test]
     fn runs_count_as_single_triangles_do() {
         let mut state = 3u64;
@@ -350,18 +339,23 @@ mod tests {
                 || -> [f32; 3] { std::array::from_fn(|a| (at[a] + (next() - 4.0) / 16.0).clamp(0.0, 8.0)) };
             triangles.push([corner(), corner(), corner()]);
         }
-        for subdiv in [1, 2, 5, 8, 16] {
-            let lattice = Lattice::new(subdiv, [0.0; 3], [8.0; 3]).unwrap();
-            let mut fast = Counter::new(lattice.clone());
-            fast.add(7, &Primitives::new(&triangles, vec![]));
-            let mut plain = vec![0u32; lattice.len()];
-            for p in &triangles {
-                triangle_cells(&lattice, &p.map(|v| v.map(f64::from)), &mut |at| {
-                    plain[lattice.index(at) as usize] += 1
-                });
+        // also a box that is far from the origin and thin, and one that is flat
+        for (shift, squeeze) in [(0.0, 1.0), (1000.0, 1.0), (1000.0, 0.001), (3.0, 0.0)] {
+            let moved: Vec<[[f32; 3]; 3]> =
+                triangles.iter().map(|p| p.map(|v| [v[0], v[1], v[2] * squeeze + shift])).collect();
+            let [lo, hi] = box_of(moved.as_flattened());
+            for subdiv in [1, 2, 5, 8, 16, 100] {
+                let lattice = Lattice::new(subdiv, lo, hi).unwrap();
+                let mut fast = Counter::new(lattice.clone());
+                fast.add(7, &Primitives::new(&lattice, &moved, vec![]));
+                let mut plain = vec![0u32; lattice.len()];
+                for p in &moved {
+                    let p = p.map(|v| v.map(f64::from));
+                    triangle_cells(&lattice, &p, &mut |at| plain[lattice.index(at) as usize] += 1);
+                }
+                let counted: Vec<u32> = fast.cells.iter().map(|c| c.primitives).collect();
+                assert_eq!(counted, plain, "{subdiv}");
             }
-            let counted: Vec<u32> = fast.cells.iter().map(|c| c.primitives).collect();
-            assert_eq!(counted, plain, "{subdiv}");
         }
     }
 }

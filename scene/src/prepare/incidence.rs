@@ -2,7 +2,7 @@
 
 use super::records::Records;
 use crate::grid::Lattice;
-use crate::grid::count::{Box3, Counter, Inside, RUN, box_of};
+use crate::grid::count::{Box3, Counter, RUN, box_of};
 use crate::grid::lattice::{round_down, round_up};
 use crate::grid::touch::{Bounds, sphere_cells, sphere_in_cell, triangle_cells, triangle_in_cell};
 
@@ -101,11 +101,10 @@ pub(crate) fn incidence(cells: &ChosenCells, groups: &[u32], records: &Records) 
     let mut out = Incidence { cells: Vec::new(), triangles: Vec::new(), spheres: Vec::new(), contested: 0 };
     let magnitude = cells.lattice.magnitude();
     let mut touched = Vec::new();
-    let mut inside = Inside::NOWHERE;
     for (first, run) in (0u32..).step_by(RUN).zip(records.triangles.chunks(RUN)) {
         let bounds = box_of(run.as_flattened());
-        if inside.moves_to(&cells.lattice, &bounds) {
-            let number = cells.number(inside.at);
+        if let Some(at) = cells.lattice.only_cell(&bounds[0], &bounds[1]) {
+            let number = cells.number(at);
             boxes[number].add(&CellBox::from(bounds));
             // a run is copied as its triangles are
             if cells.contested[number] {
@@ -119,8 +118,8 @@ pub(crate) fn incidence(cells: &ChosenCells, groups: &[u32], records: &Records) 
         for (i, p) in (first..).zip(run) {
             touched.clear();
             let bounds = box_of(p);
-            if inside.moves_to(&cells.lattice, &bounds) {
-                let number = cells.number(inside.at);
+            if let Some(at) = cells.lattice.only_cell(&bounds[0], &bounds[1]) {
+                let number = cells.number(at);
                 touched.push(number);
                 boxes[number].add(&CellBox::from(bounds));
             } else {

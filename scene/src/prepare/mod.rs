@@ -305,7 +305,7 @@ fn choose_grid(
     for (split, range) in (0..).zip(ranges) {
         let records = spool.range(range)?;
         let spheres = records.spheres.iter().map(|s| (s.center, s.radius)).collect();
-        let primitives = Primitives::new(&records.triangles, spheres);
+        let primitives = Primitives::new(counters[0].lattice(), &records.triangles, spheres);
         counters.par_iter_mut().for_each(|counter| counter.add(split, &primitives));
         progress.advance(1);
     }
