@@ -9,7 +9,8 @@
 //! 5. rays that are done are written and replaced by the next of the batch.
 //!
 //! A stack has two parallel arrays: keys and references. A key is the bits of the entry distance (not negative, so
-//! they order like integers) with the child's slot in the low three bits: it rounds the distance down by less than 8 ulp.
+//! they order like integers) with 7 - slot of the child in the low three bits: it rounds the distance down by less than 8
+//! ulp, and of children that begin at the same distance (the ray begins in them) the last slot, the smallest, comes first.
 //! An entry is skipped when its key is above `tmax | 7`, so never when its distance is at most `tmax`.
 #![allow(unsafe_code)] // intrinsics, and unchecked reads of an arena whose references were checked when it was filled
 
@@ -181,7 +182,8 @@ unsafe fn rounds<I: InstructionSet, const ANY: bool, D: FnMut(usize, &mut State)
             next += 1;
         }
         inners += flying;
-        let slots = _mm256_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7);
+        let seven = _mm256_set1_epi32(7);
+        let slots = _mm256_setr_epi32(7, 6, 5, 4, 3, 2, 1, 0);
         while flying > 0 {
             counters.nodes += inners as u64;
             counters.leaves += leaves as u64;
@@ -201,8 +203,11 @@ unsafe fn rounds<I: InstructionSet, const ANY: bool, D: FnMut(usize, &mut State)
                     let key =
                         if hits <= 4 { _mm256_castsi128_si256(sort4(_mm256_castsi256_si128(key))) } else { sort8(key) };
                     _mm256_storeu_si256(key_top, key);
-                    // the permutation reads the low three bits of each lane only: the slot
-                    _mm256_storeu_si256(reference_top, _mm256_permutevar8x32_epi32(children, key));
+                    // the permutation reads the low three bits of each lane only: 7 - slot, so flipped
+                    _mm256_storeu_si256(
+                        reference_top,
+                        _mm256_permutevar8x32_epi32(children, _mm256_xor_si256(key, seven)),
+                    );
                 }
                 state.top += hits;
             }
