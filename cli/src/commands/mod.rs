@@ -5,6 +5,7 @@ mod gc;
 mod inspect;
 mod prepare;
 mod render;
+mod replay;
 mod scene;
 
 use std::io::Write;
@@ -19,6 +20,7 @@ pub enum Command {
     Prepare(prepare::Arguments),
     Inspect(inspect::Arguments),
     Compare(compare::Arguments),
+    Replay(Box<replay::Arguments>),
     Gc(gc::Arguments),
     Scene(scene::Arguments),
 }
@@ -28,6 +30,7 @@ pub fn run(command: Command) -> anyhow::Result<ExitCode> {
     match command {
         Command::Render(arguments) => render::run(&arguments),
         Command::Compare(arguments) => compare::run(&arguments),
+        Command::Replay(arguments) => replay::run(&arguments),
         Command::Gc(arguments) => gc::run(&arguments),
         Command::Scene(arguments) => scene::run(&arguments),
         Command::Inspect(arguments) => inspect::run(&arguments),

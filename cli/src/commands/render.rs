@@ -28,7 +28,7 @@ use crate::spilling::SpillingObjects;
 use crate::store::{S3Options, Store};
 
 /// Objects of the prepared scene that stay in memory; what is more goes to a temporary folder.
-const OBJECTS_IN_MEMORY: u64 = 256 << 20;
+pub const OBJECTS_IN_MEMORY: u64 = 256 << 20;
 
 /// Render a scene to an EXR (linear) and a PNG (sRGB)
 ///
