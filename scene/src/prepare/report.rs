@@ -13,7 +13,7 @@ use crate::objects::ObjectKind;
 pub struct PrepareReport {
     /// Bytes by operation and kind, only those above 0.
     pub bytes: Vec<ByteRow>,
-    /// Seconds in the tree builder, added up over splits; the CPU time of building with one thread.
+    /// Seconds on the clock in the tree builder, added up over splits: on one thread of a quiet machine its CPU time.
     pub tree_s: f64,
 }
 
