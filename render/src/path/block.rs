@@ -8,7 +8,7 @@ use glam::Vec3;
 
 use super::diffuse::{Fate, onwards, towards_light};
 use super::interaction::Flat;
-use super::{Context, Outcome, PathRay, ShadowRay};
+use super::{Context, Outcome, PathRay, ShadowRay, wide};
 use crate::light::TriangleLight;
 use crate::math::{UnitDir, offset_origin, unit};
 use crate::ray::PathKey;
@@ -187,13 +187,15 @@ impl Block {
         // a few vertices are done sooner one by one
         let few = self.len < 4;
         if !few {
-            self.compute(context);
+            wide::compute(self, context);
         }
         self.emit(few, out, plain);
         self.len = 0;
     }
 
-    fn compute(&mut self, context: &Context) {
+    /// All phases but the last; inlined into each of their compilations.
+    #[inline(always)]
+    pub(super) fn phases(&mut self, context: &Context) {
         self.geometry();
         self.numbers(context);
         self.choose_lights(context);

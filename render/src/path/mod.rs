@@ -11,6 +11,7 @@ pub mod reference;
 mod shade;
 #[cfg(test)]
 mod tests;
+mod wide;
 
 use bytemuck::{Pod, Zeroable};
 use glam::Vec3;
