@@ -140,7 +140,13 @@ pub fn run(arguments: &Arguments) -> anyhow::Result<ExitCode> {
         let settings = JobSettings { commits, ..settings.clone() };
         let mut outcome = render(&scene, shot, &sampling, &settings, (preview, exposure))?;
         outcome.report.prepare = prepare_report(&prepared);
-        save(&scene, shot, &outcome, exposure)?;
+        let saved = save(&scene, shot, &outcome, exposure);
+        match &keep.store {
+            Some(place) => {
+                saved.with_context(|| format!("all samples are kept in {place}, run again with --resume"))?
+            }
+            None => saved?,
+        }
         tell(shot, &outcome.report, &sampling)?;
         reports.push(outcome.report);
     }
