@@ -163,7 +163,7 @@ pub struct Report {
     pub spp: u32,
     /// Camera samples that the image holds: pixels x samples per pixel.
     pub samples: u64,
-    /// Rays traced by committed tasks of this run.
+    /// Rays traced by committed tasks, those of earlier runs that this one took over included.
     pub rays: RayCounts,
     /// Bytes moved.
     pub bytes: Vec<BytesRow>,

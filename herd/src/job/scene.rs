@@ -13,6 +13,7 @@ use rayherd_scene::manifest::Manifest;
 use rayherd_scene::objects::ObjectStore;
 
 use super::JobError;
+use crate::plan::place;
 
 /// A prepared scene with its small parts in memory: world, lights, grid. Blocks stay in the store.
 pub struct PreparedScene {
@@ -57,15 +58,24 @@ impl PreparedScene {
         let s = &self.manifest.splits[split as usize];
         s.geometry.bytes + s.attributes.bytes
     }
+    /// The splits that rays can need, neighbours in space beside each other: those that own a cell. After overlap
+    /// reduction a source split may own none, as all its primitives are in copies.
+    pub fn owning_order(&self) -> Vec<u32> {
+        let owning: Vec<u32> = self.grid.owning().iter().collect();
+        let entry = |&s: &u32| &self.manifest.splits[s as usize];
+        let boxes: Vec<_> = owning.iter().map(entry).map(|s| (s.lo, s.hi)).collect();
+        place::order(&boxes).into_iter().map(|i| owning[i as usize]).collect()
+    }
     /// What every path of a frame shares.
     pub fn context<'a>(&'a self, frame: &'a Frame) -> Context<'a> {
         Context { world: &self.world, lights: &self.lights, frame }
     }
 
     /// The split where each film tile's camera rays start: the owner of the first cell on the ray through the middle of
-    /// the tile; the first split of all for a tile that looks past the scene.
+    /// the tile; the first owner of all for a tile that looks past the scene.
     pub fn start_splits(&self, frame: &Frame) -> Vec<u32> {
         let [w, h] = frame.size;
+        let first = self.grid.owning().iter().next().unwrap_or(0);
         let mut out = Vec::new();
         for y in (0..h).step_by(TILE as usize) {
             for x in (0..w).step_by(TILE as usize) {
@@ -73,7 +83,7 @@ impl PreparedScene {
                 let d = frame.camera.direction(middle(x, w), middle(y, h));
                 let ray = Ray { o: frame.camera.origin, tmin: 0.0, d, tmax: f32::INFINITY };
                 let cell = self.grid.first_cell(&ray);
-                out.push(cell.and_then(|c| c.owners.first().copied()).unwrap_or(0));
+                out.push(cell.and_then(|c| c.owners.first().copied()).unwrap_or(first));
             }
         }
         out

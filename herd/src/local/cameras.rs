@@ -8,8 +8,10 @@ use rayherd_render::frame::Frame;
 use crate::task::camera::tile_pixels;
 use crate::wave::{CameraUnit, Done};
 
-/// Most samples of a unit, so that a unit is a small part of a task.
+/// Most samples of a unit, so that a unit is a small part of a task; but a step is cut into at most so many parts, so that the
+/// number of units stays bounded.
 const UNIT_SAMPLES: u32 = 256;
+const STEP_PARTS: u32 = 64;
 
 /// Queues of units, in the order in which steps were added.
 pub struct Cameras {
@@ -33,8 +35,9 @@ impl Cameras {
     }
     /// Adds what of the samples was not taken.
     pub fn add(&mut self, samples: Range<u32>, taken: &Done) {
-        for first in samples.clone().step_by(UNIT_SAMPLES as usize) {
-            let part = first..first.saturating_add(UNIT_SAMPLES).min(samples.end);
+        let len = UNIT_SAMPLES.max((samples.end - samples.start).div_ceil(STEP_PARTS));
+        for first in samples.clone().step_by(len as usize) {
+            let part = first..first.saturating_add(len).min(samples.end);
             for tile in 0..self.starts.len() as u32 {
                 for unit in taken.missing(tile, &part) {
                     self.push_back(unit);
@@ -53,6 +56,10 @@ impl Cameras {
     pub fn rays(&self) -> BTreeMap<u32, u64> {
         let sum = |q: &VecDeque<(u64, CameraUnit)>| q.iter().map(|(_, u)| self.unit_rays(u)).sum();
         self.queues.iter().filter(|(_, q)| !q.is_empty()).map(|(&s, q)| (s, sum(q))).collect()
+    }
+    /// How many units.
+    pub fn units(&self) -> usize {
+        self.queues.values().map(VecDeque::len).sum()
     }
     /// Whether there are none left.
     pub fn is_empty(&self) -> bool {

@@ -21,7 +21,7 @@ use super::{JobOutcome, check, usage};
 use crate::job::{Image, JobError, JobSettings, NodeSpec, PreparedScene, Progress, Sampling, Status};
 use crate::ledger::{Destination, GroupRef, Inputs, Ledger, Outputs, Record, Refused, Snapshot, TaskId};
 use crate::plan::rate::Rate;
-use crate::plan::{self, Assignment, NodeView, Set, SplitView, View, Waiting, place};
+use crate::plan::{self, Assignment, NodeView, Set, SplitView, View, Waiting};
 use crate::report::{Kind, Report};
 use crate::store::MemoryStore;
 use crate::task::camera::tiles;
@@ -155,6 +155,9 @@ struct Live {
 /// Objects by name, with the nodes that hold them.
 type Objects = Vec<(String, Vec<u32>)>;
 
+/// Camera units that are queued at once, about; steps are added as they are used up.
+const QUEUED_UNITS: usize = 100_000;
+
 /// Commits between two snapshots.
 const SNAPSHOT_EVERY: u64 = 16;
 
@@ -169,7 +172,7 @@ struct Driver<'s, 'a> {
     send: Sender<Message>,
     /// Samples whose units were queued.
     queued: u32,
-    /// Splits along the curve, and back.
+    /// Splits that rays can need along the curve through space, and their places in it.
     order: Vec<u32>,
     rank: Vec<u32>,
     windows: Vec<BTreeSet<u32>>,
@@ -209,8 +212,8 @@ impl<'s, 'a> Driver<'s, 'a> {
         send: Sender<Message>,
     ) -> Self {
         let scene = shared.scene;
-        let order = place::order(&scene.manifest.splits.iter().map(|s| (s.lo, s.hi)).collect::<Vec<_>>());
-        let mut rank = vec![0; order.len()];
+        let order = scene.owning_order();
+        let mut rank = vec![0; scene.splits() as usize];
         order.iter().enumerate().for_each(|(r, &s)| rank[s as usize] = r as u32);
         let starts = scene.start_splits(shared.frame).into_iter().map(|s| rank[s as usize]).collect();
         Driver {
@@ -300,7 +303,7 @@ impl<'s, 'a> Driver<'s, 'a> {
                 self.sampling.time_limit.is_some_and(|limit| !first && self.start.elapsed().as_secs_f64() >= limit);
             let enough = (self.sampling.target_error.is_some() || self.sampling.time_limit.is_some())
                 && (!self.cameras.is_empty() || (!first && self.queued > self.ledger.taken().complete()));
-            if !first && (wait || late || enough) {
+            if !first && (wait || late || enough || self.cameras.units() > QUEUED_UNITS) {
                 return;
             }
             let end = self.step_end();
@@ -498,11 +501,9 @@ impl<'s, 'a> Driver<'s, 'a> {
         let made = match result {
             Ok(made) => made,
             Err(JobError::Stopped) => return self.lost(task, number),
-            Err(e @ JobError::Lost { .. }) => {
-                // of a task that does not run any more, nobody cares
-                self.lost(task, number)?;
-                return if self.committed.contains(&(task, number)) { Ok(()) } else { self.go_back(&e) };
-            }
+            // what a task that does not run any more read may be gone by right
+            Err(e @ JobError::Lost { .. }) if self.running.contains_key(&task) => return self.go_back(&e),
+            Err(JobError::Lost { .. }) => return Ok(()),
             Err(e) => return Err(e),
         };
         match fate {

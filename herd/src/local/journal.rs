@@ -175,17 +175,17 @@ pub async fn collect(store: &dyn BlockStore) -> Result<Collected, JobError> {
     let records = read(store).await?;
     let image = records.values().next().map(|r| r.image.clone()).unwrap_or_default();
     let Chain { records, .. } = newest(&image, records)?;
-    let mut ledger = Ledger::new(&image, 0);
+    let tiles_of = |r: &Record| {
+        let taken = r.took.camera.iter().map(|u| u.tile + 1).max();
+        r.snapshot.as_ref().map(|s| s.done.tiles()).max(taken).unwrap_or(0)
+    };
+    let mut ledger = Ledger::new(&image, records.iter().map(|r| tiles_of(&r.1)).max().unwrap_or(0));
     let mut names = Vec::new();
     let mut keys = Vec::new();
     for (name, record) in &records {
         if let Some(snapshot) = &record.snapshot {
-            ledger = Ledger::new(&image, snapshot.done.tiles());
-            names.clear();
-            names.extend(snapshot.film.iter().map(|f| f.key.clone()));
-        } else if ledger.done().tiles() == 0 {
-            let tiles = record.took.camera.iter().map(|u| u.tile + 1).max().unwrap_or(0);
-            ledger = Ledger::new(&image, tiles.max(1 << 16));
+            // it holds the sum of all parts before it
+            names = snapshot.film.iter().map(|f| f.key.clone()).collect();
         }
         ledger.replay(record, name.clone())?;
         names.extend(record.made.film.iter().map(|f| f.key.clone()));

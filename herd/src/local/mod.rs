@@ -77,7 +77,7 @@ fn check(scene: &PreparedScene, frame: &Frame, sampling: &Sampling, settings: &J
     if settings.batch == 0 {
         return refuse("a batch has at least one ray".into());
     }
-    let needed = (0..scene.splits()).map(|s| scene.split_bytes(s)).max().unwrap_or(0);
+    let needed = scene.grid.owning().iter().map(|s| scene.split_bytes(s)).max().unwrap_or(0);
     match settings.memory_per_node {
         Some(given) if given < needed => Err(JobError::Memory { needed, given }),
         _ => Ok(()),

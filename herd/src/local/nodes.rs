@@ -39,10 +39,12 @@ impl<'a> Nodes<'a> {
     pub fn new(scene: &'a PreparedScene, settings: &JobSettings, store: Arc<dyn BlockStore>) -> Result<Self, JobError> {
         let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(1).enable_all().build();
         let runtime = runtime.map_err(|e| JobError::Internal(format!("no runtime for input and output: {e}")))?;
-        let order = place::order(&scene.manifest.splits.iter().map(|s| (s.lo, s.hi)).collect::<Vec<_>>());
+        let order = scene.owning_order();
         let sizes: Vec<u64> = order.iter().map(|&s| scene.split_bytes(s)).collect();
         let count = settings.nodes.len() as u32;
-        let mut holders = vec![Vec::new(); order.len()];
+        let replicas = settings.replicas.clamp(1, count);
+        // what nobody ever reads lies on the first nodes
+        let mut holders = vec![(0..replicas).collect::<Vec<u32>>(); scene.splits() as usize];
         for (&split, on) in order.iter().zip(place::holders(&sizes, count, settings.replicas)) {
             holders[split as usize] = on;
         }
@@ -52,7 +54,7 @@ impl<'a> Nodes<'a> {
             scene,
             store,
             runtime,
-            replicas: settings.replicas.clamp(1, count),
+            replicas,
             memories: settings.nodes.iter().map(|_| Memory::new(memory)).collect(),
             holders: RwLock::new(holders),
             counts: Mutex::new(Counts { nodes, ..Counts::default() }),

@@ -48,7 +48,7 @@ fn expected(spp: u32) -> Arc<FilmPart> {
 }
 
 fn largest(scene: &PreparedScene) -> u64 {
-    (0..scene.splits()).map(|s| scene.split_bytes(s)).max().unwrap()
+    scene.grid.owning().iter().map(|s| scene.split_bytes(s)).max().unwrap()
 }
 
 /// Small tasks, so that there are many.

@@ -106,10 +106,12 @@ fn windows(view: &View) -> Vec<Vec<u32>> {
         if node.free < node.slots {
             continue;
         }
-        let own: u64 = windows[n].iter().map(|&s| rays(s)).sum();
+        // what lies on the node's own disk counts double: reading it moves nothing
+        let worth = |s: u32| rays(s) * if view.splits[s as usize].holders.contains(&(n as u32)) { 2 } else { 1 };
+        let own: u64 = windows[n].iter().map(|&s| worth(s)).sum();
         let claimed: BTreeSet<u32> =
             windows.iter().enumerate().filter(|&(m, _)| m != n).flat_map(|(_, w)| w.iter().copied()).collect();
-        let free = |s: u32| if claimed.contains(&s) { 0 } else { rays(s) };
+        let free = |s: u32| if claimed.contains(&s) { 0 } else { worth(s) };
         let best = place::fullest(&sizes, node.memory, free);
         let there: u64 = best.iter().map(|&s| free(s)).sum();
         if there > MOVE * own || (own == 0 && there > 0) {

@@ -19,16 +19,30 @@ pub(super) fn plan(view: &View) -> Vec<Assignment> {
             out.push(Assignment { node, set: set(view, split), groups, camera: None });
         }
     } else {
-        for (split, node) in choose(view, &view.camera) {
-            out.push(Assignment {
-                node,
-                set: set(view, split),
-                groups: vec![],
-                camera: Some((view.task_camera, vec![split])),
-            });
-        }
+        camera(view, &mut out);
     }
     out
+}
+
+/// Camera rays of all start splits, in as many tasks as there are slots: all rays of a round are on their way before
+/// the next round reads a split for them.
+fn camera(view: &View, out: &mut Vec<Assignment>) {
+    let mut left = view.camera.clone();
+    let mut nodes = view.nodes.to_vec();
+    loop {
+        let chosen = choose(&View { nodes: &nodes, ..view.clone() }, &left);
+        if chosen.is_empty() {
+            return;
+        }
+        for (split, node) in chosen {
+            let rays = left.entry(split).or_default();
+            let share = view.task_camera.min(*rays).max(1);
+            *rays -= share;
+            nodes[node as usize].free -= 1;
+            nodes[node as usize].warm.insert(split);
+            out.push(Assignment { node, set: set(view, split), groups: vec![], camera: Some((share, vec![split])) });
+        }
+    }
 }
 
 fn set(view: &View, split: u32) -> Set {
