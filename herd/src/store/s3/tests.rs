@@ -67,6 +67,16 @@ async fn what_goes_wrong_is_named_by_what_can_be_done() {
     assert!(error.to_string().contains("refused"), "{error}");
 }
 
+/// The TLS client is there and its crypto provider chosen: without one, rustls panics at the first connection.
+#[tokio::test]
+async fn tls_to_a_server_that_speaks_none_is_an_error() {
+    let server = S3Server::start().await;
+    let mut settings = server.settings("");
+    settings.endpoint = settings.endpoint.map(|e| e.replace("http://", "https://"));
+    let error = S3Store::connect(settings).await.unwrap_err();
+    assert!(matches!(&error, StoreError::Unavailable { .. }), "{error:?}");
+}
+
 #[tokio::test]
 async fn sees_only_its_prefix_and_only_keys() {
     let server = S3Server::start().await;
