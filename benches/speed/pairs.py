@@ -18,9 +18,8 @@ MITSUBA = """
 import sys, mitsuba as mi
 mi.set_variant('llvm_ad_rgb')
 import drjit as dr
-xml, spp, seed, depth = sys.argv[1], int(sys.argv[2]), int(sys.argv[3]), int(sys.argv[4])
-size = dict(kv.split('=') for kv in sys.argv[5:])
-scene = mi.load_file(xml, max_depth=depth, **size)
+xml, spp, seed = sys.argv[1], int(sys.argv[2]), int(sys.argv[3])
+scene = mi.load_file(xml, **dict(kv.split('=') for kv in sys.argv[4:]))
 dr.eval(mi.render(scene, spp=spp, seed=seed))
 dr.sync_thread()
 """
@@ -67,11 +66,11 @@ def main() -> None:
     rows = []
     for name in a.names:
         xml = scenes.prepare(name, a.shared.resolve(), a.work.resolve())
-        size = scenes.size_arguments(name, a.size)
+        values = scenes.parameters(xml, a.size, a.max_depth)
         spp = SPP[name]
         ours = [a.rayherd, "render", str(xml), "--size", f"{a.size}x{a.size}", "--spp", str(spp), "--max-depth", str(a.max_depth),
                 "-o", str(a.work / "bench.exr")]
-        theirs = [sys.executable, "-c", MITSUBA, str(xml), str(spp), "1", str(a.max_depth)] + [f"{k}={v}" for k, v in size.items()]
+        theirs = [sys.executable, "-c", MITSUBA, str(xml), str(spp), "1"] + [f"{k}={v}" for k, v in values.items()]
         cpu(theirs)  # fills Mitsuba's kernel cache
         for i in range(a.pairs):
             (co, wo), (ct, wt) = cpu(ours), cpu(theirs)

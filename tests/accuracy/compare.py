@@ -43,8 +43,7 @@ def main() -> int:
     print(f"{'scene':10} {'ch':2} {'rayherd':>10} {'mitsuba':>10} {'difference':>10} {'3 s.e.':>8}  tiles > 4 s.e.  verdict")
     for name in a.names:
         xml = scenes.prepare(name, a.shared.resolve(), a.work.resolve())
-        size = scenes.size_arguments(name, a.size)
-        scene = mi.load_file(str(xml), max_depth=a.max_depth, **size)
+        scene = mi.load_file(str(xml), **scenes.parameters(xml, a.size, a.max_depth))
         theirs, ours = [], []
         for i in range(a.renders):
             theirs.append(np.array(mi.render(scene, spp=a.spp, seed=1000 + i), dtype=np.float64))

@@ -32,6 +32,10 @@ def prepare(name: str, shared: Path, work: Path) -> Path:
     raise SystemExit(f"unknown scene {name}; there are {', '.join(NAMES)}")
 
 
-def size_arguments(name: str, size: int) -> dict:
-    """Parameters of the XML that set the size."""
-    return {"res": size} if name == "gyroid" else {"resx": size, "resy": size}
+def parameters(xml: Path, size: int, max_depth: int) -> dict:
+    """Values for those of the XML's parameters that set size and depth (Mitsuba refuses any that a file does not use)."""
+    text = xml.read_text()
+    values = {"res": size, "resx": size, "resy": size, "max_depth": max_depth}
+    if "$max_depth" not in text and f'name="max_depth" value="{max_depth}"' not in text:
+        raise SystemExit(f"{xml} fixes another depth than {max_depth}")
+    return {k: v for k, v in values.items() if re.search(rf"\${k}\b", text)}
