@@ -96,7 +96,7 @@ impl<'a> Primitives<'a> {
 /// a division, and no plane is computed.
 #[inline]
 fn certain_cell(subdiv: u32, [low, high]: &Place) -> Option<[u32; 3]> {
-    let cell = |q: u32| (u64::from(q) * u64::from(subdiv) >> 32) as u32;
+    let cell = |q: u32| ((u64::from(q) * u64::from(subdiv)) >> 32) as u32;
     let at = low.map(cell);
     (at == high.map(cell)).then_some(at)
 }
