@@ -1,7 +1,7 @@
 //! The `RenderJob` types, shared by the command line, the local run and the operator. Knows no client.
 //!
 //! The same YAML goes to `rayherd render -f` and to `kubectl apply -f`. Types parse ([`serde`]), describe themselves
-//! ([`schemars`]) and are checked by one pure function, [`validate`]. Numbers are `i64`, `i32` or `f64` with ranges,
+//! ([`schemars`]) and are checked by one pure function, [`validate()`]. Numbers are `i64`, `i32` or `f64` with ranges,
 //! because an OpenAPI schema knows no unsigned types.
 
 pub mod byte_size;
