@@ -27,7 +27,7 @@ pub struct Resident {
     forest: Forest,
     /// First slot and split of each block, by ascending slot.
     blocks: Vec<(u32, u32)>,
-    attributes: OnceLock<Vec<AttributeBlock>>,
+    attributes: OnceLock<Vec<Attributes>>,
     /// Held while attributes are read, so that they are read once.
     reading: Mutex<()>,
 }
@@ -86,9 +86,9 @@ impl Resident {
                     if block.shapes.iter().any(|&s| s as usize >= scene.world.shapes.len()) {
                         return Err(JobError::Scene(format!("split {split} names a shape that the world lacks")));
                     }
-                    Ok(block)
+                    Ok(Attributes::new(block))
                 });
-                let read: Vec<AttributeBlock> = read.collect::<Result<_, JobError>>()?;
+                let read: Vec<Attributes> = read.collect::<Result<_, JobError>>()?;
                 // nobody else sets it: `reading` is held
                 let _ = self.attributes.set(read);
             }
@@ -102,10 +102,45 @@ impl Resident {
     }
 }
 
+/// Runs of a shape that are searched rather than looked up one by one: their starts stay in the first cache, where a number per
+/// primitive misses the last one at each hit.
+const RUNS: usize = 256;
+
+/// Attributes of a split, with a short way to a primitive's shape.
+struct Attributes {
+    block: AttributeBlock,
+    /// First primitive of each run but the first, when there are few.
+    starts: Option<Vec<u32>>,
+    shapes: Vec<u32>,
+}
+
+impl Attributes {
+    fn new(block: AttributeBlock) -> Self {
+        let runs: Vec<&[u32]> = block.shapes.chunk_by(|a, b| a == b).take(RUNS + 1).collect();
+        if runs.len() > RUNS {
+            return Attributes { block, starts: None, shapes: Vec::new() };
+        }
+        let ends = runs.iter().scan(0, |at, run| {
+            *at += run.len() as u32;
+            Some(*at)
+        });
+        let (starts, shapes) = (ends.take(runs.len().saturating_sub(1)).collect(), runs.iter().map(|r| r[0]).collect());
+        Attributes { block, starts: Some(starts), shapes }
+    }
+
+    #[inline]
+    fn shape(&self, local: usize) -> u32 {
+        match &self.starts {
+            Some(starts) => self.shapes[starts.partition_point(|&s| s as usize <= local)],
+            None => self.block.shapes[local],
+        }
+    }
+}
+
 /// Surfaces of resident splits.
 pub struct ResidentSurfaces<'a> {
     resident: &'a Resident,
-    attributes: &'a [AttributeBlock],
+    attributes: &'a [Attributes],
 }
 
 impl Surfaces for ResidentSurfaces<'_> {
@@ -116,13 +151,14 @@ impl Surfaces for ResidentSurfaces<'_> {
         let local = (hit.prim - self.resident.blocks[block].0) as usize;
         let attributes = &self.attributes[block];
         // zeros: this one has none
-        let normals = attributes.normals.get(local).copied().filter(|n| n.as_flattened().iter().any(|&x| x != 0.0));
+        let normals =
+            attributes.block.normals.get(local).copied().filter(|n| n.as_flattened().iter().any(|&x| x != 0.0));
         Surface {
             prim: forest.prim_id(hit.prim),
-            shape: attributes.shapes[local],
+            shape: attributes.shape(local),
             geometry: forest.primitive(hit),
             normals,
-            uv: attributes.uvs.get(local).copied(),
+            uv: attributes.block.uvs.get(local).copied(),
         }
     }
 }
@@ -273,4 +309,19 @@ impl Memory {
 /// A lock; what a thread that panicked left behind is still consistent here, because nothing is changed half.
 fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn shapes_by_runs_are_those_by_number() {
+        let runs = |n: usize, len: usize| (0..n * len).map(|i| (i / len) as u32 % 7).collect::<Vec<u32>>();
+        for shapes in [vec![], vec![5], vec![1, 1, 2], runs(RUNS, 3), runs(RUNS + 1, 1), runs(1000, 2)] {
+            let attributes = Attributes::new(AttributeBlock { shapes: shapes.clone(), ..Default::default() });
+            let found: Vec<u32> = (0..shapes.len()).map(|i| attributes.shape(i)).collect();
+            assert_eq!(found, shapes);
+        }
+    }
 }
