@@ -1,7 +1,6 @@
 //! A range of memory of its own pages, huge ones where the system has them.
 #![allow(unsafe_code)] // anonymous memory is had from the operating system by pointers
 
-use std::io;
 use std::ptr::NonNull;
 
 /// Size of a huge page on x86-64 and, most often, on aarch64.
@@ -24,8 +23,8 @@ unsafe impl Sync for Arena {}
 
 impl Arena {
     /// Reserves `len` bytes of addresses, at least 1.
-    pub fn reserve(len: usize) -> io::Result<Arena> {
-        let too_large = || io::Error::new(io::ErrorKind::InvalidInput, "more bytes than there are addresses");
+    pub fn reserve(len: usize) -> Result<Arena, std::io::Error> {
+        let too_large = || std::io::Error::new(std::io::ErrorKind::InvalidInput, "more bytes than there are addresses");
         let mapped = len.max(1).checked_add(2 * HUGE).ok_or_else(too_large)? & !(HUGE - 1);
         // SAFETY: a fresh private anonymous mapping touches nothing that exists.
         let address = unsafe {
@@ -39,9 +38,9 @@ impl Arena {
             )
         };
         if address == libc::MAP_FAILED {
-            return Err(io::Error::last_os_error());
+            return Err(std::io::Error::last_os_error());
         }
-        let mapping = NonNull::new(address.cast::<u8>()).ok_or_else(io::Error::last_os_error)?;
+        let mapping = NonNull::new(address.cast::<u8>()).ok_or_else(std::io::Error::last_os_error)?;
         let skip = mapping.addr().get().next_multiple_of(HUGE) - mapping.addr().get();
         #[cfg(target_os = "linux")]
         // SAFETY: the range is our own mapping. A system without huge pages refuses, and small ones serve, more slowly.
