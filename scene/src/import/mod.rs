@@ -7,6 +7,7 @@ pub mod isosurface;
 mod mesh;
 mod metals;
 mod mitsuba;
+mod number;
 mod obj;
 mod options;
 mod placement;

@@ -4,7 +4,8 @@
 use std::path::Path;
 
 use super::mesh::{Corners, Positions, TriangleReader, budget};
-use super::source::{Source, number, show};
+use super::number::{Number, number};
+use super::source::{Source, show};
 use super::spill::{Budget, Column};
 use super::stream::StreamOptions;
 use crate::ImportError;
@@ -123,7 +124,7 @@ impl ObjReader {
     }
 
     /// The first `N` numbers of a line, of which `least` must be there (others are 0).
-    fn numbers<'w, T: std::str::FromStr + Default + Copy, const N: usize>(
+    fn numbers<'w, T: Number + Default + Copy, const N: usize>(
         &self,
         mut words: impl Iterator<Item = &'w [u8]>,
         keyword: &str,

@@ -9,7 +9,8 @@ use std::path::Path;
 
 use self::header::{Element, Format, Header, Kind, Property};
 use super::mesh::{Corners, Positions, TriangleReader, budget};
-use super::source::{Source, number, show};
+use super::number::number;
+use super::source::{Source, show};
 use super::spill::{Budget, Column};
 use super::stream::StreamOptions;
 use crate::ImportError;

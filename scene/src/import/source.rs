@@ -237,7 +237,32 @@ impl Source {
     }
 
     /// The next word between white space; none at the end of the file. Counts lines from the last [`Source::line_bytes`].
+    #[inline]
     pub fn token(&mut self) -> Result<Option<&[u8]>, ImportError> {
+        // nearly every word lies in the buffer with what ends it
+        let have = &self.buffer[self.start..self.end];
+        let (mut first, mut lines) = (0, 0);
+        while first < have.len() && is_blank(have[first]) {
+            lines += u32::from(have[first] == b'\n');
+            first += 1;
+        }
+        let mut after = first;
+        while after < have.len() && !is_blank(have[after]) {
+            after += 1;
+        }
+        self.line += lines;
+        self.pass(first);
+        if self.start + (after - first) < self.end && after - first <= MAX_TOKEN {
+            let at = self.start;
+            self.pass(after - first);
+            return Ok(Some(&self.buffer[at..at + (after - first)]));
+        }
+        self.token_at_end()
+    }
+
+    /// A word that the buffer may end in.
+    #[cold]
+    fn token_at_end(&mut self) -> Result<Option<&[u8]>, ImportError> {
         loop {
             if self.start == self.end {
                 self.fill(1)?;
@@ -246,7 +271,7 @@ impl Source {
                 }
             }
             let byte = self.buffer[self.start];
-            if !byte.is_ascii_whitespace() {
+            if !is_blank(byte) {
                 break;
             }
             self.line += u32::from(byte == b'\n');
@@ -255,7 +280,7 @@ impl Source {
         let mut length = 1;
         loop {
             let have = &self.buffer[self.start..self.end];
-            match have[length..].iter().position(|b| b.is_ascii_whitespace()) {
+            match have[length..].iter().position(|b| is_blank(*b)) {
                 Some(n) => {
                     length += n;
                     break;
@@ -305,9 +330,10 @@ impl Source {
     }
 }
 
-/// A number in text; infinities and NaN are numbers here, and preparing skips what has them.
-pub(super) fn number<T: std::str::FromStr>(text: &[u8]) -> Option<T> {
-    std::str::from_utf8(text).ok()?.parse().ok()
+/// White space as [`u8::is_ascii_whitespace`] has it; most bytes are told by the first comparison.
+#[inline]
+fn is_blank(byte: u8) -> bool {
+    byte <= b' ' && byte.is_ascii_whitespace()
 }
 
 /// Text for a message: short, and without control characters.

@@ -3,7 +3,8 @@
 use std::path::Path;
 
 use super::mesh::{Corners, TriangleReader, budget};
-use super::source::{Source, number, show};
+use super::number::number;
+use super::source::{Source, show};
 use super::spill::Budget;
 use super::stream::StreamOptions;
 use crate::ImportError;
@@ -76,7 +77,8 @@ impl StlReader {
 
     /// The next triangle of a text; a loop of more than three vertices is fanned.
     fn next_ascii(&mut self) -> Result<Option<[[f64; 3]; 3]>, ImportError> {
-        let mut corners = vec![];
+        let mut corners = [[0.0; 3]; 2];
+        let mut count = 0;
         let mut fan = match self.format {
             Format::Ascii { fan, .. } => fan,
             Format::Binary { .. } => None,
@@ -86,7 +88,7 @@ impl StlReader {
                 if let Format::Ascii { recognized: false, .. } = self.format {
                     return self.source.fail_line("no facet in this file: it is no STL file, or it is empty");
                 }
-                if !corners.is_empty() || fan.is_some() {
+                if count > 0 || fan.is_some() {
                     return self
                         .source
                         .fail_line("the file ends in the middle of a facet: it is truncated, get it again");
@@ -100,15 +102,17 @@ impl StlReader {
                         self.format = Format::Ascii { fan: Some([first, vertex]), recognized: true };
                         return Ok(Some([first, previous, vertex]));
                     }
-                    corners.push(vertex);
-                    if let [a, b, c] = corners[..] {
-                        self.format = Format::Ascii { fan: Some([a, c]), recognized: true };
-                        return Ok(Some([a, b, c]));
+                    if count == 2 {
+                        let [a, b] = corners;
+                        self.format = Format::Ascii { fan: Some([a, vertex]), recognized: true };
+                        return Ok(Some([a, b, vertex]));
                     }
+                    corners[count] = vertex;
+                    count += 1;
                 }
                 b"endloop" => {
-                    if !corners.is_empty() {
-                        return self.source.fail_line(format!("a loop of {} vertices", corners.len()));
+                    if count > 0 {
+                        return self.source.fail_line(format!("a loop of {count} vertices"));
                     }
                     fan = None;
                     self.format = Format::Ascii { fan: None, recognized: true };

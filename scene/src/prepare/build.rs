@@ -1,11 +1,12 @@
 //! A split's objects: built, encoded, stored.
 
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use rayherd_render::attributes::AttributeBlock;
 use rayherd_render::bvh::{Fork, build_block};
 
 use super::PrepareError;
+use super::clock::Clock;
 use super::counting::CountingStore;
 use super::incidence::CellBox;
 use super::records::{NORMALS, Records, UVS};
@@ -44,7 +45,7 @@ pub(crate) fn build_split(
     copied: bool,
     store: &CountingStore,
 ) -> Result<Built, PrepareError> {
-    let started = Instant::now();
+    let started = Clock::start();
     let block = block(number, records)?;
     let tree = started.elapsed();
     let geometry = store.put(ObjectKind::Geometry, &block)?;

@@ -13,6 +13,7 @@
 //! depend on threads.
 
 mod build;
+mod clock;
 mod counting;
 mod fingerprint;
 mod incidence;

@@ -13,7 +13,8 @@ use crate::objects::ObjectKind;
 pub struct PrepareReport {
     /// Bytes by operation and kind, only those above 0.
     pub bytes: Vec<ByteRow>,
-    /// Seconds on the clock in the tree builder, added up over splits: on one thread of a quiet machine its CPU time.
+    /// CPU seconds in the tree builder of the threads that each began a split, added up; what other threads helped them
+    /// with is not in it, so it is whole on one thread. (Seconds on the wall where the system does not tell.)
     pub tree_s: f64,
 }
 
