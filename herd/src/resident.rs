@@ -6,7 +6,7 @@ use std::sync::{Arc, Condvar, Mutex, MutexGuard, OnceLock, PoisonError};
 use rayherd_render::attributes::AttributeBlock;
 use rayherd_render::bvh::Forest;
 use rayherd_render::path::{Surface, Surfaces};
-use rayherd_render::ray::Hit;
+use rayherd_render::ray::{Hit, PrimId};
 use rayherd_scene::grid::SplitSet;
 
 use crate::job::{JobError, PreparedScene};
@@ -97,6 +97,7 @@ impl Resident {
         Ok(ResidentSurfaces { resident: self, attributes })
     }
 
+    #[inline(always)]
     fn block_of(&self, slot: u32) -> usize {
         if self.blocks.len() == 1 { 0 } else { self.blocks.partition_point(|b| b.0 <= slot) - 1 }
     }
@@ -144,7 +145,7 @@ pub struct ResidentSurfaces<'a> {
 }
 
 impl Surfaces for ResidentSurfaces<'_> {
-    #[inline]
+    #[inline(always)]
     fn surface(&self, _index: usize, hit: &Hit) -> Surface {
         let forest = &self.resident.forest;
         let block = self.resident.block_of(hit.prim);
@@ -154,12 +155,14 @@ impl Surfaces for ResidentSurfaces<'_> {
         let normals =
             attributes.block.normals.get(local).copied().filter(|n| n.as_flattened().iter().any(|&x| x != 0.0));
         Surface {
-            prim: forest.prim_id(hit.prim),
             shape: attributes.shape(local),
             geometry: forest.primitive(hit),
             normals,
             uv: attributes.block.uvs.get(local).copied(),
         }
+    }
+    fn prim(&self, _index: usize, hit: &Hit) -> PrimId {
+        self.resident.forest.prim_id(hit.prim)
     }
 }
 

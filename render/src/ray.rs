@@ -32,6 +32,8 @@ pub struct Hit {
     pub prim: u32,
     /// Where the primitive's vertices lie in the forest's arena (opaque).
     pub leaf: u32,
+    /// Which of that leaf's primitives it is (opaque).
+    pub lane: u32,
 }
 
 /// `Hit::prim` of a ray that hit nothing.
@@ -40,7 +42,7 @@ pub const MISS: u32 = u32::MAX;
 impl Hit {
     /// No hit, with `t` at the ray's limit.
     pub const fn miss(tmax: f32) -> Self {
-        Hit { t: tmax, u: 0.0, v: 0.0, prim: MISS, leaf: 0 }
+        Hit { t: tmax, u: 0.0, v: 0.0, prim: MISS, leaf: 0, lane: 0 }
     }
     /// Whether something was hit.
     pub const fn is_hit(&self) -> bool {

@@ -148,7 +148,7 @@ impl Replay<'_> {
         let material = &self.scene.world.materials[shape.material as usize];
         let at = self.source_point(std::array::from_fn(|a| ray.o[a] + hit.t * d[a]));
         let (name, made_of) = (shape.name.clone(), material.name.clone());
-        self.line(format_args!("  hits primitive {} of shape {name:?}, material {made_of:?}", surface.prim));
+        self.line(format_args!("  hits primitive {} of shape {name:?}, material {made_of:?}", surfaces.prim(0, hit)));
         self.line(format_args!("  at {at:?}, t {}, u {}, v {}", hit.t, hit.u, hit.v));
     }
 

@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use rayherd_render::film::FilmPart;
 use rayherd_render::frame::Frame;
 use rayherd_render::path::{Context, Outcome, PathRay, Surface, Surfaces, shade};
-use rayherd_render::ray::Hit;
+use rayherd_render::ray::{Hit, PrimId};
 use rayherd_scene::grid::SplitSet;
 
 use super::nodes::Nodes;
@@ -300,6 +300,9 @@ struct NoSurfaces;
 impl Surfaces for NoSurfaces {
     fn surface(&self, _: usize, _: &Hit) -> Surface {
         unreachable!("a miss has no surface")
+    }
+    fn prim(&self, _: usize, _: &Hit) -> PrimId {
+        unreachable!("a miss has no primitive")
     }
 }
 

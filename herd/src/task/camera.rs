@@ -2,7 +2,8 @@
 
 use rayherd_render::film::TILE;
 use rayherd_render::frame::Frame;
-use rayherd_render::path::{PathRay, camera_ray};
+use rayherd_render::path::{PathRay, camera_rays};
+use rayherd_render::ray::Ray;
 
 use crate::wave::CameraUnit;
 
@@ -13,6 +14,9 @@ pub struct CameraFeed<'a> {
     current: Option<(CameraUnit, Cursor)>,
     /// Rays made so far.
     pub made: u64,
+    /// Pixel and sample of those to be made together.
+    samples: Vec<[u32; 2]>,
+    rays: Vec<Ray>,
 }
 
 #[derive(Clone, Copy)]
@@ -25,17 +29,34 @@ struct Cursor {
 impl<'a> CameraFeed<'a> {
     /// Rays of the units, in their order.
     pub fn new(frame: &'a Frame, units: Vec<CameraUnit>) -> Self {
-        CameraFeed { frame, units: units.into_iter(), current: None, made: 0 }
+        CameraFeed { frame, units: units.into_iter(), current: None, made: 0, samples: Vec::new(), rays: Vec::new() }
     }
 
     /// Appends rays until `out` has `len` of them or there are none left.
     pub fn fill(&mut self, out: &mut Vec<PathRay>, len: usize) {
-        while out.len() < len {
+        let mut rays = std::mem::take(&mut self.rays);
+        rays.clear();
+        self.fill_traced(out, &mut rays, len);
+        self.rays = rays;
+    }
+
+    /// The same, and appends what the kernel takes for each to `rays`.
+    pub fn fill_traced(&mut self, out: &mut Vec<PathRay>, rays: &mut Vec<Ray>, len: usize) {
+        let wanted = len.saturating_sub(out.len());
+        self.samples.clear();
+        self.take(wanted);
+        self.made += self.samples.len() as u64;
+        camera_rays(self.frame, &self.samples, out, rays);
+    }
+
+    /// Gathers up to `wanted` samples.
+    fn take(&mut self, wanted: usize) {
+        let width = self.frame.size[0];
+        while self.samples.len() < wanted {
             let Some((unit, mut at)) = self.current.take().or_else(|| self.next_unit()) else { return };
             let [(x0, x1), (_, y1)] = tile(self.frame, unit.tile);
-            while out.len() < len {
-                out.push(camera_ray(self.frame, at.y * self.frame.size[0] + at.x, at.sample));
-                self.made += 1;
+            while self.samples.len() < wanted {
+                self.samples.push([at.y * width + at.x, at.sample]);
                 at.sample += 1;
                 if at.sample == unit.end {
                     (at.sample, at.x) = (unit.first, at.x + 1);

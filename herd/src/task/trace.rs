@@ -5,7 +5,7 @@
 
 use rayherd_render::bvh::{Kernel, Tracer, UnsupportedKernel};
 use rayherd_render::film::FilmPart;
-use rayherd_render::path::{Context, Outcome, PathRay, Surfaces, shade};
+use rayherd_render::path::{Context, Outcome, PathRay, Surfaces, shade, shade_traced};
 use rayherd_render::ray::{Hit, MISS, Ray};
 use rayherd_scene::grid::Grid;
 
@@ -70,53 +70,48 @@ impl Loop {
     ) -> Result<(), JobError> {
         let forest = resident.forest();
         let mut pending: Vec<PathRay> = flights.paths.drain(..).map(|f| f.ray).collect();
-        self.outcome.shadow.extend(flights.shadows.drain(..).map(|f| f.ray));
-        let mut current: Vec<PathRay> = Vec::new();
+        let mut rays: Vec<Ray> = pending.iter().map(PathRay::ray).collect();
+        for flight in flights.shadows.drain(..) {
+            self.outcome.shadow.push(flight.ray);
+            self.outcome.shadow_rays.push(flight.ray.ray());
+        }
         loop {
             stop.check()?;
             self.occlude(resident, film);
             let from = pending.len().saturating_sub(self.batch);
-            current.clear();
-            current.extend(pending.drain(from..));
             let made = camera.made;
-            camera.fill(&mut current, self.batch);
+            camera.fill_traced(&mut pending, &mut rays, from + self.batch);
             self.count_camera(camera.made - made, context);
-            if current.is_empty() {
+            if pending.is_empty() {
                 return Ok(());
             }
-            self.rays_in.clear();
-            self.rays_in.extend(current.iter().map(PathRay::ray));
-            self.hits.resize(self.rays_in.len(), Hit::miss(0.0));
-            self.tracer.closest(forest, &self.rays_in, &mut self.hits);
-            shade(context, surfaces, &current, &self.hits, &mut self.outcome);
+            self.hits.resize(pending.len() - from, Hit::miss(0.0));
+            self.tracer.closest(forest, &rays[from..], &mut self.hits);
+            shade_traced(context, surfaces, &pending[from..], &rays[from..], &self.hits, &mut self.outcome);
+            pending.truncate(from);
+            rays.truncate(from);
             self.collect(film);
             pending.append(&mut self.outcome.next);
+            rays.append(&mut self.outcome.next_rays);
         }
     }
 
     /// Adds what was shaded to the film, and counts the rays that it made.
     fn collect(&mut self, film: &mut FilmPart) {
-        for light in self.outcome.light.drain(..) {
-            film.add(light.pixel, light.sample, light.value);
-        }
+        film.add_all(self.outcome.light.drain(..).map(|l| (l.pixel, l.sample, l.value)));
         self.rays.closest += self.outcome.next.len() as u64;
         self.rays.shadow += self.outcome.shadow.len() as u64;
     }
 
     /// Traces the shadow rays of the last batch where nothing else can be in the way.
     fn occlude(&mut self, resident: &Resident, film: &mut FilmPart) {
-        let shadows = &self.outcome.shadow;
-        self.rays_in.clear();
-        self.rays_in.extend(shadows.iter().map(|s| s.ray()));
+        let (shadows, rays) = (&mut self.outcome.shadow, &mut self.outcome.shadow_rays);
         self.occluded.resize(shadows.len(), false);
-        self.tracer.any(resident.forest(), &self.rays_in, &mut self.occluded);
-        for (shadow, occluded) in shadows.iter().zip(&self.occluded) {
-            if !occluded {
-                let light = shadow.light();
-                film.add(light.pixel, light.sample, light.value);
-            }
-        }
-        self.outcome.shadow.clear();
+        self.tracer.any(resident.forest(), rays, &mut self.occluded);
+        let seen = shadows.iter().zip(&self.occluded).filter(|(_, occluded)| !**occluded);
+        film.add_all(seen.map(|(s, _)| (s.key.pixel, s.key.sample, s.contribution)));
+        shadows.clear();
+        rays.clear();
     }
 
     /// Traces rays until all have ended or left the resident splits.
@@ -262,6 +257,7 @@ impl Loop {
         out.paths.extend(self.outcome.next.drain(..).map(PathFlight::new));
         let shadows = self.outcome.shadow.drain(..);
         out.shadows.extend(shadows.map(|ray| ShadowFlight { ray, visit: Visit::START }));
+        self.outcome.clear();
     }
 
     /// Counts camera rays.

@@ -53,6 +53,7 @@ impl Arena {
     }
 
     /// All of it.
+    #[inline(always)]
     pub fn bytes(&self) -> &[u8] {
         // SAFETY: base..base + len lies in the mapping, is initialised (zeros) and lives as long as self.
         unsafe { std::slice::from_raw_parts(self.base.as_ptr(), self.len) }

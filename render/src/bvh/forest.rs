@@ -246,19 +246,20 @@ impl Forest {
     ///
     /// # Panics
     /// When the hit is none of this forest as it is.
+    #[inline(always)]
     pub fn primitive(&self, hit: &Hit) -> Primitive {
-        let block = self.block_of(hit.prim);
-        let (at, n) = (offset(hit.leaf), leaf_len(hit.leaf));
-        let within = block.at as usize..(block.at + block.bytes) as usize;
-        assert!(within.contains(&at) && at + n * PRIMITIVE_BYTES <= within.end, "a hit of another forest");
-        let arena = self.arena.bytes();
-        let i = (0..n).find(|&i| read_u32(arena, at + (INDEX_ROW * n + i) * 4) == hit.prim);
-        let i = i.expect("a hit of another forest");
-        if hit.prim - block.first_slot < block.triangles {
-            return Primitive::Triangle(read_triangle(arena, at, n, i));
+        let (at, n, i) = (offset(hit.leaf), leaf_len(hit.leaf), hit.lane as usize);
+        let leaf = &self.arena.bytes()[at..at + n * PRIMITIVE_BYTES];
+        assert!(i < n && read_u32(leaf, (INDEX_ROW * n + i) * 4) == hit.prim, "a hit of another forest");
+        if self.sphere_root().is_some() && !self.is_triangle(hit.prim) {
+            let Sphere { center, radius, flipped } = read_sphere(leaf, 0, n, i);
+            return Primitive::Sphere { center, radius, flipped };
         }
-        let Sphere { center, radius, flipped } = read_sphere(arena, at, n, i);
-        Primitive::Sphere { center, radius, flipped }
+        Primitive::Triangle(read_triangle(leaf, 0, n, i))
+    }
+    fn is_triangle(&self, slot: u32) -> bool {
+        let block = self.block_of(slot);
+        slot - block.first_slot < block.triangles
     }
 
     /// Whether the primitive in slot `a` goes before the one in `b` at the same distance: by global id, and copies of one
@@ -284,10 +285,12 @@ impl Forest {
         self.largest
     }
     /// The spheres' root, a node, if there are any.
+    #[inline(always)]
     pub(super) fn sphere_root(&self) -> Option<u32> {
         Some(node_ref(self.tree(1).root)).filter(|&root| root != node_ref(EMPTY_TREE.root))
     }
 
+    #[inline(always)]
     fn tree(&self, i: usize) -> Tree {
         self.roots.expect("a forest is traced after finish()")[i]
     }

@@ -65,10 +65,12 @@ pub(super) const fn leaf_ref(at: usize, n: usize) -> u32 {
 }
 
 /// Reads the u32 at byte `at`.
+#[inline(always)]
 pub(super) fn read_u32(bytes: &[u8], at: usize) -> u32 {
     u32::from_le_bytes([bytes[at], bytes[at + 1], bytes[at + 2], bytes[at + 3]])
 }
 /// Reads the f32 at byte `at`.
+#[inline(always)]
 pub(super) fn read_f32(bytes: &[u8], at: usize) -> f32 {
     f32::from_bits(read_u32(bytes, at))
 }

@@ -98,12 +98,36 @@ impl FilmPart {
             self.reject(pixel, sample);
             return;
         }
-        let (x, y) = (pixel % self.size[0], pixel / self.size[0]);
-        let tile = (y / TILE * self.size[0].div_ceil(TILE) + x / TILE) as usize;
-        let sums = &mut self.tiles[tile].get_or_insert_with(Tile::new).0[(y % TILE * TILE + x % TILE) as usize];
-        for (sum, x) in sums[(sample & 1) as usize].iter_mut().zip(value) {
-            *sum = sum.wrapping_add(fixed(x));
+        let (tile, at) = self.place(pixel);
+        let sums = &mut self.tiles[tile].get_or_insert_with(Tile::new).0[at];
+        add(&mut sums[(sample & 1) as usize], value);
+    }
+
+    /// Adds many: [`FilmPart::add`] of (pixel, sample, value). Where neighbours are of one pixel, which paths of one picture mostly
+    /// are, its place is looked up once.
+    #[inline]
+    pub fn add_all(&mut self, light: impl Iterator<Item = (u32, u32, [f32; 3])>) {
+        let (mut last, mut tile, mut at) = (None, 0, 0);
+        for (pixel, sample, value) in light {
+            if !value.iter().all(|&x| (0.0..LIMIT).contains(&x)) {
+                self.reject(pixel, sample);
+                continue;
+            }
+            if last != Some(pixel) {
+                last = Some(pixel);
+                (tile, at) = self.place(pixel);
+            }
+            let sums = &mut self.tiles[tile].get_or_insert_with(Tile::new).0[at];
+            add(&mut sums[(sample & 1) as usize], value);
         }
+    }
+
+    /// Tile of a pixel, and its place in the tile.
+    #[inline]
+    fn place(&self, pixel: u32) -> (usize, usize) {
+        let (x, y) = (pixel % self.size[0], pixel / self.size[0]);
+        let tile = y / TILE * self.size[0].div_ceil(TILE) + x / TILE;
+        (tile as usize, (y % TILE * TILE + x % TILE) as usize)
     }
 
     #[cold]
@@ -142,6 +166,13 @@ impl FilmPart {
             Some(tile) => &tile.0[(y % TILE * TILE + x % TILE) as usize],
             None => &NONE,
         }
+    }
+}
+
+#[inline(always)]
+fn add(sums: &mut [i128; 3], value: [f32; 3]) {
+    for (sum, x) in sums.iter_mut().zip(value) {
+        *sum = sum.wrapping_add(fixed(x));
     }
 }
 

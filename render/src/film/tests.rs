@@ -51,6 +51,14 @@ fn order_and_parts_do_not_matter() {
     let whole = filled(&adds);
     assert_eq!(whole.rejected().count, 4);
     assert_eq!(whole.rejected().keys.iter().copied().collect::<Vec<_>>(), [(5, 3), (6, 3), (7, 3), (8, 3)]);
+    let mut together = FilmPart::new(SIZE);
+    together.add_all(adds.iter().copied());
+    assert_eq!(together, whole);
+    let mut runs = adds.clone();
+    runs.sort_by_key(|a| a.0 / 3 * 3);
+    let mut together = FilmPart::new(SIZE);
+    together.add_all(runs.into_iter());
+    assert_eq!(together, whole);
     let mut rng = Rng(3);
     let mut parts = vec![FilmPart::new(SIZE); 5];
     let mut shuffled = adds.clone();

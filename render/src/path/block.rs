@@ -11,8 +11,8 @@ use super::interaction::Flat;
 use super::{Context, Outcome, PathRay, ShadowRay, wide};
 use crate::light::TriangleLight;
 use crate::math::{UnitDir, offset_origin, unit};
-use crate::ray::PathKey;
-use crate::sampler::{BSDF, LIGHT, LIGHT_CHOICE, ROULETTE, Stream};
+use crate::ray::{PathKey, Ray};
+use crate::sampler::{BSDF, LIGHT, LIGHT_CHOICE, ROULETTE, Streams};
 
 /// Vertices of a block.
 pub(super) const N: usize = 32;
@@ -104,8 +104,10 @@ pub(super) struct Block {
     lit: [bool; N],
     // results
     shadow_dir: [UnitDir; N],
+    shadow_d: Lanes3,
     contribution: Lanes3,
     next_dir: [UnitDir; N],
+    next_d: Lanes3,
     next_throughput: Lanes3,
     next_pdf: Lanes,
     fate: [Fate; N],
@@ -150,8 +152,10 @@ impl Default for Block {
             light_pdf: lanes,
             lit: [false; N],
             shadow_dir: [UnitDir::default(); N],
+            shadow_d: Lanes3::ZERO,
             contribution: Lanes3::ZERO,
             next_dir: [UnitDir::default(); N],
+            next_d: Lanes3::ZERO,
             next_throughput: Lanes3::ZERO,
             next_pdf: lanes,
             fate: [Fate::Absorbed; N],
@@ -219,10 +223,11 @@ impl Block {
     #[inline(always)]
     fn numbers(&mut self, context: &Context) {
         let frame = context.frame;
+        let mut streams = Streams::new(frame.seed);
         for i in 0..self.len {
             let key = self.key[i];
             let vertex = u32::from(key.vertex) + 1;
-            let stream = Stream::new(frame.seed, key.pixel, key.sample);
+            let stream = streams.get(key.pixel, key.sample);
             let numbers = stream.vertex(vertex, frame.split, u32::from(key.branch));
             self.direction[0][i] = unit(numbers[BSDF]);
             self.direction[1][i] = unit(numbers[BSDF + 1]);
@@ -295,7 +300,7 @@ impl Block {
     #[inline(always)]
     fn shadow_rays(&mut self) {
         for i in 0..N {
-            let (dir, contribution) = towards_light(
+            let (dir, d, contribution) = towards_light(
                 self.throughput.get(i),
                 self.reflectance.get(i),
                 self.normal.get(i),
@@ -305,6 +310,7 @@ impl Block {
                 self.lit[i],
             );
             self.shadow_dir[i] = dir;
+            self.shadow_d.set(i, d);
             self.contribution.set(i, contribution);
         }
     }
@@ -312,7 +318,7 @@ impl Block {
     #[inline(always)]
     fn next_rays(&mut self, siblings: f32) {
         for i in 0..N {
-            let (dir, throughput, pdf, fate) = onwards(
+            let (dir, d, throughput, pdf, fate) = onwards(
                 self.throughput.get(i),
                 self.reflectance.get(i),
                 self.normal.get(i),
@@ -322,6 +328,7 @@ impl Block {
                 siblings,
             );
             self.next_dir[i] = dir;
+            self.next_d.set(i, d);
             self.next_throughput.set(i, throughput);
             self.next_pdf[i] = pdf;
             self.fate[i] = fate;
@@ -346,15 +353,19 @@ impl Block {
             if contribution != Vec3::ZERO {
                 let (dir, tmax) = (self.shadow_dir[i], self.light_tmax[i]);
                 out.shadow.push(ShadowRay { o, dir, tmax, contribution: contribution.to_array(), key });
+                out.shadow_rays.push(Ray { o, tmin: 0.0, d: self.shadow_d.get(i).to_array(), tmax });
             }
             match self.fate[i] {
-                Fate::On => out.next.push(PathRay {
-                    o,
-                    dir: self.next_dir[i],
-                    key: PathKey { vertex: key.vertex + 1, ..key },
-                    throughput: self.next_throughput.get(i).to_array(),
-                    pdf: self.next_pdf[i],
-                }),
+                Fate::On => {
+                    out.next.push(PathRay {
+                        o,
+                        dir: self.next_dir[i],
+                        key: PathKey { vertex: key.vertex + 1, ..key },
+                        throughput: self.next_throughput.get(i).to_array(),
+                        pdf: self.next_pdf[i],
+                    });
+                    out.next_rays.push(Ray { o, tmin: 0.0, d: self.next_d.get(i).to_array(), tmax: f32::INFINITY });
+                }
                 Fate::Absorbed => out.counters.absorbed += 1,
                 Fate::Roulette => out.counters.roulette += 1,
             }

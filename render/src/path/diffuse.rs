@@ -25,7 +25,7 @@ fn select(yes: bool, a: Vec3, b: Vec3) -> Vec3 {
     Vec3::new(pick(a.x, b.x), pick(a.y, b.y), pick(a.z, b.z))
 }
 
-/// The direction to a light sample, snapped, and the contribution of a shadow ray along it: 0 when there is none.
+/// The direction to a light sample, snapped, as code and as floats, and the contribution of a shadow ray along it: 0 when there is none.
 ///
 /// `n` is the normal on the side of the path, `d`, `pdf` and `radiance` the light sample, which counts when `ok`.
 #[inline(always)]
@@ -37,7 +37,7 @@ pub(super) fn towards_light(
     pdf: f32,
     radiance: Vec3,
     ok: bool,
-) -> (UnitDir, Vec3) {
+) -> (UnitDir, Vec3, Vec3) {
     let dir = UnitDir::encode(d.to_array());
     let wi = Vec3::from(dir.decode());
     let cos = wi.dot(n);
@@ -45,10 +45,10 @@ pub(super) fn towards_light(
     let weight = bsdf * (power_heuristic(pdf, bsdf) / pdf);
     let contribution = throughput * reflectance * radiance * weight;
     // before snapping too, which is cheap to know first
-    (dir, select(ok & (d.dot(n) > 0.0) & (cos > 0.0), contribution, Vec3::ZERO))
+    (dir, wi, select(ok & (d.dot(n) > 0.0) & (cos > 0.0), contribution, Vec3::ZERO))
 }
 
-/// The next direction, snapped, its throughput and density. `go_on` in [0, 1) decides roulette, when `roulette` says that it takes place, with
+/// The next direction, snapped, as code and as floats, its throughput and density. `go_on` in [0, 1) decides roulette, when `roulette` says that it takes place, with
 /// `siblings` times the throughput.
 #[inline(always)]
 pub(super) fn onwards(
@@ -59,12 +59,13 @@ pub(super) fn onwards(
     go_on: f32,
     roulette: bool,
     siblings: f32,
-) -> (UnitDir, Vec3, f32, Fate) {
+) -> (UnitDir, Vec3, Vec3, f32, Fate) {
     // cosine-weighted (Malley's method); the weight is the albedo
     let [x, y] = concentric_disk(u);
     let z2 = 1.0 - x * x - y * y;
     let dir = UnitDir::encode(Basis::new(n).to_world(Vec3::new(x, y, z2.max(0.0).sqrt())).to_array());
-    let cos = Vec3::from(dir.decode()).dot(n);
+    let wi = Vec3::from(dir.decode());
+    let cos = wi.dot(n);
     let throughput = throughput * reflectance;
     let largest = throughput.x.max(throughput.y).max(throughput.z);
     let chance = if roulette { (largest * siblings).min(0.95) } else { 1.0 };
@@ -75,5 +76,5 @@ pub(super) fn onwards(
     } else {
         Fate::On
     };
-    (dir, throughput / chance, cos * FRAC_1_PI, fate)
+    (dir, wi, throughput / chance, cos * FRAC_1_PI, fate)
 }

@@ -7,6 +7,7 @@
 mod block;
 mod diffuse;
 mod interaction;
+mod primary;
 pub mod reference;
 mod shade;
 #[cfg(test)]
@@ -23,7 +24,8 @@ use crate::ray::{Hit, PathKey, PrimId, Ray};
 use crate::sampler::Stream;
 use crate::world::{Primitive, World};
 
-pub use shade::shade;
+pub use primary::camera_rays;
+pub use shade::{shade, shade_traced};
 
 /// A ray looking for the nearest hit, with what its path needs to go on. 48 bytes.
 #[repr(C)]
@@ -94,8 +96,6 @@ pub struct Contribution {
 /// The primitive that was hit, with its attributes.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Surface {
-    /// Its global id.
-    pub prim: PrimId,
     /// Its shape.
     pub shape: u32,
     /// Where it is.
@@ -110,6 +110,8 @@ pub struct Surface {
 pub trait Surfaces {
     /// The surface of the hit (never a miss) of ray `index` of the batch.
     fn surface(&self, index: usize, hit: &Hit) -> Surface;
+    /// The global id of what ray `index` hit: asked for where light is met only.
+    fn prim(&self, index: usize, hit: &Hit) -> PrimId;
 }
 
 /// What every path shares.
@@ -130,12 +132,17 @@ pub struct Outcome {
     pub light: Vec<Contribution>,
     /// To be traced until anything is hit.
     pub shadow: Vec<ShadowRay>,
+    /// The same for the kernel: `shadow[i].ray()`, which shading has at hand.
+    pub shadow_rays: Vec<Ray>,
     /// To be traced to the nearest hit.
     pub next: Vec<PathRay>,
+    /// The same for the kernel: `next[i].ray()`.
+    pub next_rays: Vec<Ray>,
     /// What happened.
     pub counters: Counters,
     /// Memory that `shade` keeps between calls.
     block: Option<Box<block::Block>>,
+    rays: Vec<Ray>,
 }
 
 impl Outcome {
@@ -143,7 +150,9 @@ impl Outcome {
     pub fn clear(&mut self) {
         self.light.clear();
         self.shadow.clear();
+        self.shadow_rays.clear();
         self.next.clear();
+        self.next_rays.clear();
     }
 }
 

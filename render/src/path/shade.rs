@@ -8,7 +8,7 @@ use super::interaction::Interaction;
 use super::{Context, Contribution, Outcome, PathRay, ShadowRay, Surface, Surfaces, power_heuristic};
 use crate::material::Bsdf;
 use crate::math::{UnitDir, unit};
-use crate::ray::{Hit, PathKey};
+use crate::ray::{Hit, PathKey, PrimId, Ray};
 use crate::sampler::{BSDF, LIGHT, LIGHT_CHOICE, ROULETTE, Stream};
 use crate::world::Primitive;
 
@@ -20,15 +20,33 @@ use crate::world::Primitive;
 /// Depth and roulette are Mitsuba's, so that equal settings mean equal work: a path has at most `max_depth` rays; after ray number `rr_depth`
 /// and later ones it goes on with probability min(largest channel of the throughput, 0.95).
 pub fn shade<S: Surfaces>(context: &Context, surfaces: &S, rays: &[PathRay], hits: &[Hit], out: &mut Outcome) {
+    let mut traced = std::mem::take(&mut out.rays);
+    traced.clear();
+    traced.extend(rays.iter().map(PathRay::ray));
+    shade_traced(context, surfaces, rays, &traced, hits, out);
+    out.rays = traced;
+}
+
+/// [`shade`] where the rays are at hand as they were traced: `traced[i]` is `rays[i].ray()` but for its `tmax`.
+pub fn shade_traced<S: Surfaces>(
+    context: &Context,
+    surfaces: &S,
+    rays: &[PathRay],
+    traced: &[Ray],
+    hits: &[Hit],
+    out: &mut Outcome,
+) {
     let mut block = out.block.take().unwrap_or_default();
-    for (index, (ray, hit)) in rays.iter().zip(hits).enumerate() {
-        out.counters.shaded += 1;
+    out.counters.shaded += rays.len() as u64;
+    for (index, ((ray, traced), hit)) in rays.iter().zip(traced).zip(hits).enumerate() {
         if !hit.is_hit() {
             out.counters.missed += 1;
             emit(ray, context.lights.sky(), context.lights.sky_pdf(), out);
             continue;
         }
-        arrive(context, ray, hit, &surfaces.surface(index, hit), out, |vertex, out| {
+        let surface = surfaces.surface(index, hit);
+        let prim = || surfaces.prim(index, hit);
+        arrive(context, ray, traced.d.into(), hit, &surface, prim, out, |vertex, out| {
             let full = block.push(Vertex { index: index as u32, ..vertex });
             if full {
                 flush(context, surfaces, rays, hits, &mut block, out);
@@ -56,7 +74,8 @@ pub(super) fn shade_plain<S: Surfaces>(
             continue;
         }
         let surface = surfaces.surface(index, hit);
-        arrive(context, ray, hit, &surface, out, |vertex, out| {
+        let prim = || surfaces.prim(index, hit);
+        arrive(context, ray, ray.dir.decode().into(), hit, &surface, prim, out, |vertex, out| {
             scatter_plain(context, ray, vertex.key, vertex.throughput, hit, &surface, out);
         });
     }
@@ -91,16 +110,17 @@ fn emit(ray: &PathRay, radiance: Vec3, light_pdf: f32, out: &mut Outcome) {
 fn arrive(
     context: &Context,
     ray: &PathRay,
+    d: Vec3,
     hit: &Hit,
     surface: &Surface,
+    prim: impl Fn() -> PrimId,
     out: &mut Outcome,
     mut each: impl FnMut(Vertex, &mut Outcome),
 ) {
     let frame = context.frame;
     let shape = &context.world.shapes[surface.shape as usize];
-    let d = Vec3::from(ray.dir.decode());
     if let Some(emission) = shape.emission {
-        emit_surface(context, ray, d, hit, surface, emission.into(), out);
+        emit_surface(context, ray, d, hit, surface, prim(), emission.into(), out);
     }
     let number = u32::from(ray.key.vertex) + 1;
     if number >= frame.max_depth {
@@ -138,6 +158,7 @@ fn emit_surface(
     d: Vec3,
     hit: &Hit,
     surface: &Surface,
+    prim: PrimId,
     emission: Vec3,
     out: &mut Outcome,
 ) {
@@ -145,7 +166,7 @@ fn emit_surface(
     if let Some(at) = Interaction::new(o, d, hit, surface)
         && at.from_front
     {
-        let pdf = if ray.pdf > 0.0 { context.lights.pdf(surface.prim, o, hit.t, -at.normal.dot(d)) } else { 0.0 };
+        let pdf = if ray.pdf > 0.0 { context.lights.pdf(prim, o, hit.t, -at.normal.dot(d)) } else { 0.0 };
         emit(ray, emission, pdf, out);
     }
 }
@@ -189,19 +210,22 @@ pub(super) fn scatter_plain(
     };
     let shadow = |dir: UnitDir, tmax: f32, contribution: Vec3, out: &mut Outcome| {
         if contribution != Vec3::ZERO {
-            let contribution = contribution.to_array();
-            out.shadow.push(ShadowRay { o: origin.to_array(), dir, tmax, contribution, key });
+            let ray = ShadowRay { o: origin.to_array(), dir, tmax, contribution: contribution.to_array(), key };
+            out.shadow.push(ray);
+            out.shadow_rays.push(ray.ray());
         }
     };
 
     let (dir, throughput, pdf, fate) = if let (Bsdf::Diffuse { reflectance }, true) = (&material.bsdf, at.is_flat()) {
         let reflectance = Vec3::from(*reflectance);
         if let Some(light) = light {
-            let (dir, contribution) =
+            let (dir, _, contribution) =
                 towards_light(throughput, reflectance, at.normal, light.d, light.pdf, light.radiance, true);
             shadow(dir, light.tmax, contribution, out);
         }
-        onwards(throughput, reflectance, at.normal, direction, go_on, roulette, siblings)
+        let (dir, _, throughput, pdf, fate) =
+            onwards(throughput, reflectance, at.normal, direction, go_on, roulette, siblings);
+        (dir, throughput, pdf, fate)
     } else {
         let bsdf = &material.bsdf;
         let basis = at.basis(surface, bsdf.is_anisotropic());
@@ -245,7 +269,9 @@ pub(super) fn scatter_plain(
     };
     match fate {
         Fate::On => {
-            out.next.push(PathRay { o: origin.to_array(), dir, key: next_key, throughput: throughput.to_array(), pdf });
+            let ray = PathRay { o: origin.to_array(), dir, key: next_key, throughput: throughput.to_array(), pdf };
+            out.next.push(ray);
+            out.next_rays.push(ray.ray());
         }
         Fate::Absorbed => out.counters.absorbed += 1,
         Fate::Roulette => out.counters.roulette += 1,

@@ -66,10 +66,7 @@ impl Stream {
     /// The two numbers of the place on the film.
     #[inline(always)]
     pub fn film(&self) -> [u32; 2] {
-        let key = vertex_key(self.key, 0);
-        let mut x = [0; 8];
-        add_rows(&mut x, self.index, FIRST_DIMENSIONS);
-        [scramble(x[0], lane_key(key, 0)), scramble(x[1], lane_key(key, 1))]
+        film_numbers(self.index, film_keys(self.key))
     }
 
     /// The eight numbers of vertex `vertex` (1: first hit) of child `child` of `split`.
@@ -92,6 +89,65 @@ impl Stream {
         }
         out
     }
+}
+
+/// Streams of one sample after the other: where neighbours are of one pixel, its keys are hashed once.
+pub(crate) struct Streams {
+    seed: u64,
+    /// The last pixel; above 32 bits at first.
+    pixel: u64,
+    keys: [u64; 2],
+    film: [[u32; 2]; 2],
+}
+
+impl Streams {
+    pub(crate) fn new(seed: u64) -> Streams {
+        Streams { seed, pixel: u64::MAX, keys: [0; 2], film: [[0; 2]; 2] }
+    }
+
+    /// [`Stream::new`].
+    #[inline(always)]
+    pub(crate) fn get(&mut self, pixel: u32, sample: u32) -> Stream {
+        if self.pixel != u64::from(pixel) {
+            self.pixel = u64::from(pixel);
+            self.keys = [0, 1].map(|half| Stream::new(self.seed, pixel, half).key);
+        }
+        Stream { key: self.keys[(sample & 1) as usize], index: sample >> 1 }
+    }
+
+    /// What [`film_numbers`] wants for a sample.
+    #[inline(always)]
+    pub(crate) fn film(&mut self, pixel: u32, sample: u32) -> (u32, [u32; 2]) {
+        if self.pixel != u64::from(pixel) {
+            self.get(pixel, sample);
+            self.film = self.keys.map(film_keys);
+        }
+        (sample >> 1, self.film[(sample & 1) as usize])
+    }
+}
+
+/// The two numbers of the place on the film of a sample with an index in its half.
+#[inline(always)]
+pub(crate) fn film_numbers(index: u32, keys: [u32; 2]) -> [u32; 2] {
+    // of dimension 0 the index is the point, with its bits reversed
+    [scramble(index, keys[0]), scramble(pascal(index), keys[1])]
+}
+
+#[inline(always)]
+fn film_keys(stream: u64) -> [u32; 2] {
+    let key = vertex_key(stream, 0);
+    [lane_key(key, 0), lane_key(key, 1)]
+}
+
+/// The point of dimension 1, with its bits reversed. Its matrix is Pascal's triangle modulo 2, where entry (k, j) is 1 if the bits of j are
+/// among those of k (Lucas): so a bit of the result is the sum of the index's bits at all k that contain its j, an axis at a time.
+#[inline(always)]
+fn pascal(index: u32) -> u32 {
+    let x = index ^ index >> 16;
+    let x = x ^ (x & 0xff00_ff00) >> 8;
+    let x = x ^ (x & 0xf0f0_f0f0) >> 4;
+    let x = x ^ (x & 0xcccc_cccc) >> 2;
+    x ^ (x & 0xaaaa_aaaa) >> 1
 }
 
 /// The slow twin of [`Stream`], straight from the definitions: the number of one dimension of one vertex; vertex 0 is the film with

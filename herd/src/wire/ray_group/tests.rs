@@ -239,7 +239,7 @@ impl Heap {
             let root = (b * b - a * c).max(0.0).sqrt();
             for t in [(-b - root) / a, (-b + root) / a] {
                 if b * b > a * c && t > 1e-4 && (t as f32) < hit.t {
-                    hit = Hit { t: t as f32, u: 0.0, v: 0.0, prim: i as u32, leaf: 0 };
+                    hit = Hit { t: t as f32, u: 0.0, v: 0.0, prim: i as u32, leaf: 0, lane: 0 };
                 }
             }
         }
@@ -253,7 +253,10 @@ impl Surfaces for Seen<'_> {
     fn surface(&self, _index: usize, hit: &Hit) -> Surface {
         let (center, radius) = self.0.spheres[hit.prim as usize];
         let geometry = Primitive::Sphere { center, radius, flipped: false };
-        Surface { prim: hit.prim.into(), shape: hit.prim, geometry, normals: None, uv: None }
+        Surface { shape: hit.prim, geometry, normals: None, uv: None }
+    }
+    fn prim(&self, _: usize, hit: &Hit) -> PrimId {
+        hit.prim.into()
     }
 }
 

@@ -104,7 +104,8 @@ impl Tracer {
             hits[i] = if state.prim == MISS {
                 Hit::miss(rays[i].tmax)
             } else {
-                Hit { t: state.tmax, u: state.uv[0], v: state.uv[1], prim: state.prim, leaf: state.leaf }
+                let [u, v] = state.uv;
+                Hit { t: state.tmax, u, v, prim: state.prim, leaf: state.leaf, lane: state.lane }
             };
         });
     }
@@ -196,9 +197,9 @@ fn runs(kernel: Kernel) -> bool {
 
 /// Takes a hit with `tmin < t <= tmax` if it is nearer than the best so far or, at the same distance, has the smaller id.
 #[inline(always)]
-fn accept(forest: &Forest, state: &mut State, t: f32, uv: [f32; 2], slot: u32, leaf: u32) {
+fn accept(forest: &Forest, state: &mut State, t: f32, uv: [f32; 2], slot: u32, leaf: u32, lane: u32) {
     if t < state.tmax || (t == state.tmax && (state.prim == MISS || forest.precedes(slot, state.prim))) {
-        (state.tmax, state.uv, state.prim, state.leaf) = (t, uv, slot, leaf);
+        (state.tmax, state.uv, state.prim, state.leaf, state.lane) = (t, uv, slot, leaf, lane);
     }
 }
 

@@ -19,7 +19,7 @@ pub(super) fn triangles(forest: &Forest, state: &mut State, any: bool, stack: &m
         let (at, n) = (offset(leaf), leaf_len(leaf));
         for i in 0..n {
             if let Some(Intersection { t, uv }) = intersect(state, &read_triangle(arena, at, n, i)) {
-                accept(forest, state, t, uv, read_u32(arena, at + (INDEX_ROW * n + i) * 4), leaf);
+                accept(forest, state, t, uv, read_u32(arena, at + (INDEX_ROW * n + i) * 4), leaf, i as u32);
             }
         }
         any && state.prim != MISS
@@ -42,7 +42,7 @@ pub(super) fn spheres(
         for i in 0..n {
             let s = read_sphere(arena, at, n, i);
             if let Some(t) = sphere::intersect(ray, state.tmin, state.tmax, s.center, s.radius) {
-                accept(forest, state, t, [0.0; 2], read_u32(arena, at + (INDEX_ROW * n + i) * 4), leaf);
+                accept(forest, state, t, [0.0; 2], read_u32(arena, at + (INDEX_ROW * n + i) * 4), leaf, i as u32);
             }
         }
         any && state.prim != MISS
@@ -98,6 +98,9 @@ fn enter(state: &State, aabb: &Aabb) -> Option<f32> {
 }
 
 /// Vertices of the i-th triangle of a leaf of n.
+#[inline(always)]
 pub(in super::super) fn read_triangle(arena: &[u8], leaf: usize, n: usize, i: usize) -> [[f32; 3]; 3] {
-    std::array::from_fn(|v| std::array::from_fn(|c| read_f32(arena, leaf + ((v * 3 + c) * n + i) * 4)))
+    // written out: closures over arrays become calls
+    let at = |row: usize| read_f32(arena, leaf + (row * n + i) * 4);
+    [[at(0), at(1), at(2)], [at(3), at(4), at(5)], [at(6), at(7), at(8)]]
 }

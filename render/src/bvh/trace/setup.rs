@@ -95,6 +95,8 @@ pub(super) struct State {
     pub uv: [f32; 2],
     /// Leaf of the best hit.
     pub leaf: u32,
+    /// Place of the best hit in its leaf.
+    pub lane: u32,
 }
 
 impl State {
@@ -115,6 +117,7 @@ impl State {
         prim: MISS,
         uv: [0.0; 2],
         leaf: 0,
+        lane: 0,
     };
 
     /// State at the start of a ray in a forest whose largest coordinate is `largest`.

@@ -229,7 +229,7 @@ unsafe fn rounds<I: InstructionSet, const ANY: bool, D: FnMut(usize, &mut State)
                 while mask != 0 {
                     let k = mask.trailing_zeros() as usize;
                     mask &= mask - 1;
-                    accept(forest, state, f.t[k], [f.u[k], f.v[k]], *indices.add(k), reference);
+                    accept(forest, state, f.t[k], [f.u[k], f.v[k]], *indices.add(k), reference, k as u32);
                 }
                 if ANY {
                     state.top = BASE as u32;

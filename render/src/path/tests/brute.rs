@@ -9,7 +9,7 @@ use crate::frame::Frame;
 use crate::material::{Bsdf, Material};
 use crate::path::reference::Tracer;
 use crate::path::{Surface, Surfaces};
-use crate::ray::{Hit, MISS, Ray};
+use crate::ray::{Hit, MISS, PrimId, Ray};
 use crate::world::{EmissivePrimitive, Primitive, ShapeInfo, World};
 
 /// A scene in a list.
@@ -80,7 +80,10 @@ impl Scene {
 impl Surfaces for Scene {
     fn surface(&self, _index: usize, hit: &Hit) -> Surface {
         let (geometry, shape) = self.primitives[hit.prim as usize];
-        Surface { prim: u64::from(hit.prim), shape, geometry, normals: self.normals[hit.prim as usize], uv: None }
+        Surface { shape, geometry, normals: self.normals[hit.prim as usize], uv: None }
+    }
+    fn prim(&self, _index: usize, hit: &Hit) -> PrimId {
+        hit.prim.into()
     }
 }
 
@@ -96,7 +99,7 @@ impl Tracer for Scene {
                 && t > ray.tmin
                 && (t < best.t || (t == best.t && best.prim == MISS))
             {
-                best = Hit { t, u, v, prim: i as u32, leaf: 0 };
+                best = Hit { t, u, v, prim: i as u32, leaf: 0, lane: 0 };
             }
         }
         best

@@ -6,13 +6,14 @@ use super::brute::{Scene, frame};
 use super::furnace::box_inside;
 use super::{cornell, mean_of};
 use crate::film::FilmPart;
+use crate::filter::Filter;
 use crate::frame::Frame;
 use crate::light::Lights;
 use crate::material::{Bsdf, Distribution};
 use crate::math::UnitDir;
 use crate::path::reference::{self, Tracer};
 use crate::path::shade::shade_plain;
-use crate::path::{Context, Outcome, PathRay, camera_ray, shade};
+use crate::path::{Context, Outcome, PathRay, ShadowRay, camera_ray, camera_rays, shade};
 use crate::ray::{Hit, PathKey};
 use crate::testing::Rng;
 
@@ -122,6 +123,10 @@ fn check_batches(scene: &Scene, split: u32) {
         shade_plain(&context, scene, &rays, &hits, &mut parts);
         assert_eq!((&parts.light, &parts.shadow, &parts.next), (&whole.light, &whole.shadow, &whole.next));
         assert_eq!(parts.counters, whole.counters);
+        for out in [&whole, &parts] {
+            assert!(out.next.iter().map(PathRay::ray).eq(out.next_rays.iter().copied()));
+            assert!(out.shadow.iter().map(ShadowRay::ray).eq(out.shadow_rays.iter().copied()));
+        }
         for size in [1, 2, 3, 7, 16, 100] {
             parts.clear();
             for (r, h) in rays.chunks(size).zip(hits.chunks(size)) {
@@ -143,6 +148,23 @@ fn check_batches(scene: &Scene, split: u32) {
         };
         assert_eq!(sorted(&parts), sorted(&whole));
         rays = whole.next;
+    }
+}
+
+/// Blocks of camera rays, full, part full or of a few, are those made one by one, for every filter.
+#[test]
+fn camera_rays_in_blocks_are_those_one_by_one() {
+    for filter in [Filter::Box, Filter::Tent { radius: 1.5 }, Filter::Gaussian { stddev: 0.5 }] {
+        let frame = Frame { filter, seed: 77, ..cornell::frame(50) };
+        for (runs, len) in [(100, 1), (40, 3), (5, 32), (3, 70), (1, 2), (0, 0)] {
+            let samples: Vec<[u32; 2]> =
+                (0..runs).flat_map(|i| (0..len).map(move |s| [i * 997 % 2500, s + i * 1000])).collect();
+            let (mut paths, mut rays) = (Vec::new(), Vec::new());
+            camera_rays(&frame, &samples, &mut paths, &mut rays);
+            let one_by_one: Vec<PathRay> = samples.iter().map(|s| camera_ray(&frame, s[0], s[1])).collect();
+            assert_eq!(paths, one_by_one);
+            assert!(rays.iter().copied().eq(one_by_one.iter().map(PathRay::ray)));
+        }
     }
 }
 
@@ -311,7 +333,7 @@ fn nothing_is_nan() {
             let hit = if traced.is_hit() {
                 traced
             } else {
-                Hit { t: rng.f32() * 10.0, u, v: (1.0 - u) * rng.f32(), prim, leaf: 0 }
+                Hit { t: rng.f32() * 10.0, u, v: (1.0 - u) * rng.f32(), prim, leaf: 0, lane: 0 }
             };
             shade(&context, &scene, &[ray], &[hit], &mut out);
         }
