@@ -1,6 +1,7 @@
 //! The loop over rounds: plan, run attempts on threads, commit, until every ray has come to its end.
 
 use std::collections::{BTreeMap, BTreeSet};
+use std::ops::Range;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
 use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender, channel};
@@ -20,6 +21,7 @@ use super::slots::{Gate, StopFlag};
 use super::{JobOutcome, check, usage};
 use crate::job::{Image, JobError, JobSettings, NodeSpec, PreparedScene, Progress, Sampling, Status};
 use crate::ledger::{Destination, GroupRef, Inputs, Ledger, Outputs, Record, Refused, Snapshot, TaskId};
+use crate::plan::cost::Traffic;
 use crate::plan::rate::Rate;
 use crate::plan::{self, Assignment, NodeView, Set, SplitView, View, Waiting};
 use crate::report::{Kind, Report};
@@ -175,7 +177,10 @@ struct Driver<'s, 'a> {
     /// Splits that rays can need along the curve through space, and their places in it.
     order: Vec<u32>,
     rank: Vec<u32>,
+    /// How `auto` cuts the scene, in places along the curve, and what each node holds of it.
+    cut: Option<Vec<Range<u32>>>,
     windows: Vec<BTreeSet<u32>>,
+    traffic: Traffic,
     free: Vec<u32>,
     running: BTreeMap<TaskId, Running>,
     live: BTreeMap<(TaskId, u32), Live>,
@@ -234,7 +239,9 @@ impl<'s, 'a> Driver<'s, 'a> {
             send,
             order,
             rank,
+            cut: None,
             windows: vec![BTreeSet::new(); shared.settings.nodes.len()],
+            traffic: Traffic::default(),
             free: shared.settings.nodes.iter().map(|n| n.slots).collect(),
             running: BTreeMap::new(),
             live: BTreeMap::new(),
@@ -349,22 +356,12 @@ impl<'s, 'a> Driver<'s, 'a> {
     }
 
     /// What to start now, with the keys of the groups that each takes.
-    fn plan(&self) -> Vec<(Assignment, Vec<String>)> {
+    fn plan(&mut self) -> Vec<(Assignment, Vec<String>)> {
         let settings = self.shared.settings;
         let holders = self.shared.nodes.holders();
         let split =
             |&s: &u32| SplitView { bytes: self.shared.scene.split_bytes(s), holders: holders[s as usize].clone() };
         let splits: Vec<SplitView> = self.order.iter().map(split).collect();
-        let node = |(n, spec): (usize, &NodeSpec)| {
-            let memory = self.shared.nodes.memory(n as u32);
-            let warm = if settings.strategy == plan::Strategy::Auto {
-                self.windows[n].clone()
-            } else {
-                memory.warm().into_iter().map(|s| self.rank[s as usize]).collect()
-            };
-            NodeView { slots: spec.slots, free: self.free[n], memory: memory.capacity().min(FOREST_BYTES), warm }
-        };
-        let nodes: Vec<NodeView> = settings.nodes.iter().enumerate().map(node).collect();
         let groups: Vec<&GroupRef> = self.ledger.waiting().collect();
         let mut waiting: BTreeMap<u32, Vec<Waiting>> = BTreeMap::new();
         let mut reduce = Vec::new();
@@ -375,24 +372,65 @@ impl<'s, 'a> Driver<'s, 'a> {
                 Destination::Reduce(_) => reduce.push(entry),
             }
         }
-        let view = View {
+        let mut view = View {
             strategy: settings.strategy,
             splits: &splits,
-            nodes: &nodes,
+            nodes: &self.nodes_as_seen(),
             waiting,
             reduce,
             camera: self.cameras.rays(),
             task_rays: self.rate.rays(settings.task_seconds),
             task_camera: self.rate.camera(settings.task_seconds),
             least_rays: u64::from(settings.batch),
+            replicas: settings.replicas,
+            forest: FOREST_BYTES,
+            cut: self.cut.as_deref().unwrap_or_default(),
+            traffic: self.traffic,
         };
+        // a new cut is worth a thought when nothing is under way that was made for the old one
+        let (mut cut, nodes) = (None, view.nodes.iter().map(|n| NodeView { warm: BTreeSet::new(), ..n.clone() }));
+        let nodes: Vec<NodeView> = nodes.collect();
+        if settings.strategy == plan::Strategy::Auto
+            && (self.cut.is_none() || (self.live.is_empty() && groups.is_empty()))
+        {
+            cut = Some(plan::cut::choose(&view)).filter(|c| Some(c) != self.cut.as_ref());
+        }
+        if let Some(cut) = &cut {
+            (view.cut, view.nodes) = (cut, &nodes);
+        }
         let plan = plan::plan(&view);
-        plan.into_iter()
-            .map(|a| {
-                let keys = a.groups.iter().map(|&g| groups[g].key.clone()).collect();
-                (a, keys)
-            })
-            .collect()
+        let keys = |a: &Assignment| a.groups.iter().map(|&g| groups[g].key.clone()).collect();
+        let plan = plan.into_iter().map(|a| (keys(&a), a)).map(|(keys, a)| (a, keys)).collect();
+        if cut.is_some() {
+            self.windows.iter_mut().for_each(BTreeSet::clear);
+            self.cut = cut;
+        }
+        plan
+    }
+
+    /// The nodes as the planner sees them.
+    fn nodes_as_seen(&self) -> Vec<NodeView> {
+        let settings = self.shared.settings;
+        let node = |(n, spec): (usize, &NodeSpec)| {
+            let memory = self.shared.nodes.memory(n as u32);
+            let warm = if settings.strategy == plan::Strategy::Auto {
+                self.windows[n].clone()
+            } else {
+                memory.warm().into_iter().map(|s| self.rank[s as usize]).collect()
+            };
+            NodeView { slots: spec.slots, free: self.free[n], memory: memory.capacity(), warm }
+        };
+        settings.nodes.iter().enumerate().map(node).collect()
+    }
+
+    /// Remembers the window that a node of `auto` is to hold: beside what it holds if there is room, else instead of it.
+    fn hold(&mut self, node: u32, ranks: &[u32]) {
+        let scene = self.shared.scene;
+        let held = &mut self.windows[node as usize];
+        let both: BTreeSet<u32> = held.iter().chain(ranks).copied().collect();
+        let bytes: u64 = both.iter().map(|&r| scene.split_bytes(self.order[r as usize])).sum();
+        let beside = bytes <= self.shared.nodes.memory(node).capacity() && !self.cut.as_ref().is_none_or(Vec::is_empty);
+        *held = if beside { both } else { ranks.iter().copied().collect() };
     }
 
     /// Starts a task as planned; false if there was nothing left for it to do.
@@ -409,15 +447,14 @@ impl<'s, 'a> Driver<'s, 'a> {
         if groups.is_empty() && camera.is_empty() {
             return Ok(false);
         }
-        let split = |rank: u32| self.order[rank as usize];
         let set = match plan.set {
             Set::Resident(ranks) => {
-                self.windows[plan.node as usize] = ranks.iter().copied().collect();
-                let mut splits: Vec<u32> = ranks.into_iter().map(split).collect();
+                self.hold(plan.node, &ranks);
+                let mut splits: Vec<u32> = ranks.into_iter().map(|r| self.order[r as usize]).collect();
                 splits.sort_unstable();
                 Set::Resident(splits)
             }
-            Set::Sharing(rank) => Set::Sharing(split(rank)),
+            Set::Sharing(rank) => Set::Sharing(self.order[rank as usize]),
             other => other,
         };
         let (task, groups) = self.ledger.start(&Inputs { groups, camera: camera.clone() })?;
@@ -477,8 +514,13 @@ impl<'s, 'a> Driver<'s, 'a> {
                 return;
             }
             let Some(first) = self.live.iter().find(|(k, _)| k.0 == task).map(|(_, l)| l.node) else { continue };
-            let same_window = |n: u32| {
-                settings.strategy != plan::Strategy::Auto || self.windows[n as usize] == self.windows[first as usize]
+            let same_window = |n: u32| match &self.running[&task].spec.set {
+                Set::Resident(set) if settings.strategy == plan::Strategy::Auto => {
+                    let held = &self.windows[n as usize];
+                    let moving = self.cut.as_ref().is_none_or(Vec::is_empty);
+                    set.iter().all(|&s| held.contains(&self.rank[s as usize])) && (!moving || held.len() == set.len())
+                }
+                _ => true,
             };
             let nodes = (0..self.free.len() as u32).filter(|&n| self.free[n as usize] > 0 && same_window(n));
             // on another node, if there is one
@@ -559,8 +601,11 @@ impl<'s, 'a> Driver<'s, 'a> {
         let made_rays = record.made.rays;
         self.rate.add(cpu, made_rays.closest + made_rays.shadow, made_rays.camera);
         self.tasks += 1;
+        let bytes = record.made.groups.iter().map(|g| g.bytes).sum::<u64>();
+        let windows = self.cut.as_ref().map_or(0, Vec::len).max(1);
+        self.traffic.add(made_rays.camera, made_rays.closest + made_rays.shadow, windows, made.hops, bytes);
         self.hops += made.hops;
-        self.hop_bytes += record.made.groups.iter().map(|g| g.bytes).sum::<u64>();
+        self.hop_bytes += bytes;
         if let Some(film) = record.made.film {
             if self.owner.is_some() {
                 self.superfluous[1].push((film.key, film.holders));

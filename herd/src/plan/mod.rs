@@ -1,17 +1,21 @@
 //! Which task runs where, with what. Pure: a function of what waits, who is free and what is warm.
 //!
 //! The planner minimises bytes moved, then time: a split goes where it is warm, else where a copy lies on disk, else
-//! to any free slot. The paper's strategies take the splits with most rays, one a slot; `auto` gives each node a
-//! window of neighbouring splits as large as its memory.
+//! to any free slot. The paper's strategies take the splits with most rays, one a slot; `auto` cuts the scene into windows
+//! of neighbouring splits and keeps them warm.
 
 mod auto;
+pub mod cost;
+pub mod cut;
 mod grid;
+mod moving;
 pub mod place;
 pub mod rate;
 #[cfg(test)]
 mod tests;
 
 use std::collections::{BTreeMap, BTreeSet};
+use std::ops::Range;
 
 pub use rayherd_api::Strategy;
 
@@ -67,6 +71,21 @@ pub struct View<'a> {
     pub task_camera: u64,
     /// Fewer rays are not worth a task while others run.
     pub least_rays: u64,
+    /// Copies of each object.
+    pub replicas: u32,
+    /// Scene data that one task can hold, bytes.
+    pub forest: u64,
+    /// For `auto`: windows that cover the splits, as [`cut::choose`] made them; none where they move.
+    pub cut: &'a [Range<u32>],
+    /// What rays did so far.
+    pub traffic: cost::Traffic,
+}
+
+impl View<'_> {
+    /// Slots of a node, at least 1 so that it can divide.
+    fn slots(&self, node: u32) -> f64 {
+        f64::from(self.nodes[node as usize].slots.max(1))
+    }
 }
 
 /// The data that a task works with.
@@ -105,6 +124,7 @@ pub fn plan(view: &View) -> Vec<Assignment> {
     match view.strategy {
         Strategy::DemandDriven => demand_driven(view),
         Strategy::SchedulingGrid | Strategy::SchedulingGridOverlapReduced => grid::plan(view),
+        Strategy::Auto if view.cut.is_empty() => moving::plan(view),
         Strategy::Auto => auto::plan(view),
     }
 }
@@ -133,13 +153,7 @@ fn demand_driven(view: &View) -> Vec<Assignment> {
 fn deal_camera(view: &View, slots: &mut Vec<u32>, set: Set) -> Vec<Assignment> {
     let mut left: u64 = view.camera.values().sum();
     let all: u64 = view.nodes.iter().map(|n| u64::from(n.slots)).sum();
-    // guided: a share of what is left, so that slots end together
-    let share = left.div_ceil(2 * all.max(1)).clamp(1, view.task_camera.max(1));
-    let share = if view.strategy == Strategy::Auto {
-        share
-    } else {
-        left.div_ceil(all.max(1)).clamp(1, view.task_camera.max(1))
-    };
+    let share = left.div_ceil(all.max(1)).clamp(1, view.task_camera.max(1));
     let mut out = Vec::new();
     while left > 0
         && let Some(node) = slots.pop()

@@ -1,4 +1,4 @@
-//! Where blocks lie, and which windows of them nodes hold: neighbours in space on the same node.
+//! Where blocks lie: neighbours in space on the same node.
 
 /// Order of splits along a Morton curve through the middles of their boxes (in units of `box_size` from `lo`).
 ///
@@ -44,70 +44,6 @@ pub fn holders(sizes: &[u64], nodes: u32, replicas: u32) -> Vec<Vec<u32>> {
             (0..copies).map(|k| (part + nodes - k) % nodes).collect()
         })
         .collect()
-}
-
-/// Windows of neighbouring splits that fit the nodes' memories, spread evenly over the curve (which is closed to a
-/// ring), so that all nodes together hold as much of the scene as they can.
-pub fn windows(sizes: &[u64], memory: &[u64]) -> Vec<Vec<u32>> {
-    let total: u64 = sizes.iter().sum();
-    let n = sizes.len();
-    let starts = spread(sizes, memory);
-    let fill = |start: usize, memory: u64| {
-        let mut window = Vec::new();
-        let mut left = memory;
-        for k in 0..n {
-            let s = (start + k) % n;
-            if sizes[s] > left {
-                break;
-            }
-            left -= sizes[s];
-            window.push(s as u32);
-        }
-        window.sort_unstable();
-        window
-    };
-    let spaced: Vec<Vec<u32>> = memory.iter().zip(&starts).map(|(&m, &start)| fill(start, m)).collect();
-    if n == 0 || total == 0 || covers(n, &spaced) {
-        return spaced;
-    }
-    // one after the other covers more when there is little to spare
-    let mut at = 0;
-    memory
-        .iter()
-        .map(|&m| {
-            let window = fill(at, m);
-            at = (at + window.len()) % n;
-            window
-        })
-        .collect()
-}
-
-/// Start of each node's window: node `i` of `n` at the split that holds the point `i / n` of the bytes.
-fn spread(sizes: &[u64], memory: &[u64]) -> Vec<usize> {
-    let total: u128 = sizes.iter().map(|&s| u128::from(s)).sum();
-    let n = memory.len().max(1) as u128;
-    (0..memory.len() as u128)
-        .map(|i| {
-            let point = total * i / n;
-            let mut before = 0u128;
-            sizes
-                .iter()
-                .position(|&s| {
-                    // the same rule as for holders: a split belongs to the part that its middle is in
-                    let middle = before + u128::from(s) / 2;
-                    before += u128::from(s);
-                    middle >= point
-                })
-                .unwrap_or(0)
-        })
-        .collect()
-}
-
-/// Whether every split is in some window.
-pub fn covers(splits: usize, windows: &[Vec<u32>]) -> bool {
-    let mut seen = vec![false; splits];
-    windows.iter().flatten().for_each(|&s| seen[s as usize] = true);
-    seen.iter().all(|s| *s)
 }
 
 /// The window of at most `memory` bytes with most rays; of equals the first.

@@ -1,0 +1,62 @@
+//! What moving bytes, rays and time cost, in one unit: the bytes that a node reads from its own disk in that time.
+//!
+//! The weights are fixed, so that a plan is a function of counts and never of how fast a machine was just now.
+
+/// A byte from another node costs as much as so many from the own disk.
+pub const REMOTE: u64 = 2;
+
+/// A slot that stands idle for the time of tracing and shading a ray costs as much as moving so many bytes: about a
+/// microsecond (0.9 to 1.3 on the chest scan that the results are about), in which a link of 1 Gbit/s moves 125.
+pub const RAY: u64 = 128;
+
+/// What a job's rays did so far; what is assumed before they did anything counts as some rays more.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Traffic {
+    /// Camera rays made.
+    camera: f64,
+    /// Rays traced, camera rays among them.
+    rays: f64,
+    /// Rays that left their task's splits.
+    hops: f64,
+    /// Bytes of ray groups, one copy.
+    bytes: f64,
+    /// Rays, each times [`boundaries`] of the cut they were traced in.
+    exposed: f64,
+}
+
+/// Rays for which the assumptions stand.
+const ASSUMED: f64 = 10_000.0;
+
+/// What of a space is boundary when it is cut into so many parts, by how many a straight line passes: the cube root of
+/// their number, less the one part in which it begins. 0 for one part.
+fn boundaries(windows: usize) -> f64 {
+    libm::cbrt(windows as f64) - 1.0
+}
+
+impl Traffic {
+    /// Counts a task: camera rays made, rays traced in a cut of so many windows, rays that left, bytes of their groups.
+    pub fn add(&mut self, camera: u64, rays: u64, windows: usize, hops: u64, bytes: u64) {
+        self.camera += camera as f64;
+        self.rays += rays as f64;
+        self.hops += hops as f64;
+        self.bytes += bytes as f64;
+        self.exposed += rays as f64 * boundaries(windows);
+    }
+    /// Rays traced for each camera ray, itself included. Assumed: itself and one more.
+    pub fn rays_per_camera(&self) -> f64 {
+        (self.rays + 2.0 * ASSUMED) / (self.camera + ASSUMED)
+    }
+    /// Bytes of a ray on its way. Assumed: 20.
+    pub fn bytes_per_hop(&self) -> f64 {
+        (self.bytes + 20.0 * ASSUMED) / (self.hops + ASSUMED)
+    }
+    /// Hops of a ray in a cut of so many windows. Assumed: a third of what a line through the whole scene makes, as most
+    /// rays are shorter.
+    pub fn hops_per_ray(&self, windows: usize) -> f64 {
+        (self.hops + ASSUMED / 3.0) / (self.exposed + ASSUMED) * boundaries(windows)
+    }
+    /// Cost of a ray's way to the node that it waits for: a copy written here, the others elsewhere, one read there.
+    pub fn hop(&self, replicas: u32) -> f64 {
+        self.bytes_per_hop() * (1 + u64::from(replicas.max(1)) * REMOTE) as f64
+    }
+}
