@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 pub use rayherd_render::filter::Filter;
-pub use rayherd_render::material::{Bsdf, Distribution, Material};
+pub use rayherd_render::material::{Bsdf, Distribution, Material, Transmittance};
 use serde::{Deserialize, Serialize};
 
 /// Where in a source file something stands, for messages.

@@ -7,6 +7,45 @@ from pathlib import Path
 
 NAMES = ["cornell", "veach-mis", "gyroid"]
 
+# one small scene per material: a ball and a tilted plate of it over a grey floor, a large light above, a sky
+MATERIALS = {
+    "diffuse": '<bsdf type="diffuse"><rgb name="reflectance" value="0.8, 0.5, 0.2"/></bsdf>',
+    "conductor": '<bsdf type="conductor"><string name="material" value="Au"/></bsdf>',
+    "roughconductor": '<bsdf type="roughconductor"><string name="material" value="Cu"/><float name="alpha" value="0.3"/></bsdf>',
+    "roughconductor-ggx": '<bsdf type="roughconductor"><string name="material" value="Ag"/><float name="alpha" value="0.4"/>'
+    '<string name="distribution" value="ggx"/></bsdf>',
+    "dielectric": '<bsdf type="dielectric"/>',
+    "thindielectric": '<bsdf type="thindielectric"><float name="int_ior" value="1.8"/></bsdf>',
+    "roughdielectric": '<bsdf type="roughdielectric"><float name="alpha" value="0.2"/></bsdf>',
+    "roughdielectric-ggx": '<bsdf type="roughdielectric"><float name="alpha" value="0.5"/>'
+    '<string name="distribution" value="ggx"/><rgb name="specular_transmittance" value="0.9, 0.6, 0.8"/></bsdf>',
+    "plastic": '<bsdf type="plastic"><rgb name="diffuse_reflectance" value="0.2, 0.5, 0.8"/></bsdf>',
+    "plastic-nonlinear": '<bsdf type="plastic"><rgb name="diffuse_reflectance" value="0.2, 0.5, 0.8"/>'
+    '<boolean name="nonlinear" value="true"/></bsdf>',
+    "roughplastic": '<bsdf type="roughplastic"><rgb name="diffuse_reflectance" value="0.2, 0.5, 0.8"/>'
+    '<float name="alpha" value="0.2"/></bsdf>',
+    "roughplastic-ggx": '<bsdf type="roughplastic"><rgb name="diffuse_reflectance" value="0.9, 0.5, 0.1"/>'
+    '<float name="alpha" value="0.4"/><string name="distribution" value="ggx"/><boolean name="nonlinear" value="true"/></bsdf>',
+}
+
+SMALL = """<scene version="3.0.0">
+<default name="res" value="128"/><default name="spp" value="16"/><default name="max_depth" value="8"/>
+<integrator type="path"><integer name="max_depth" value="$max_depth"/></integrator>
+<sensor type="perspective"><float name="fov" value="38"/>
+<transform name="to_world"><lookat origin="0, 2.2, 6" target="0, 0.8, 0" up="0, 1, 0"/></transform>
+<sampler type="independent"><integer name="sample_count" value="$spp"/></sampler>
+<film type="hdrfilm"><integer name="width" value="$res"/><integer name="height" value="$res"/><rfilter type="box"/></film></sensor>
+<emitter type="constant"><rgb name="radiance" value="0.4, 0.5, 0.6"/></emitter>
+<shape type="rectangle"><transform name="to_world"><scale value="2"/><rotate x="1" angle="90"/><translate x="1" y="5" z="1"/></transform>
+<emitter type="area"><rgb name="radiance" value="4, 3.5, 3"/></emitter></shape>
+<shape type="rectangle"><transform name="to_world"><scale value="6"/><rotate x="1" angle="-90"/></transform>
+<bsdf type="diffuse"><rgb name="reflectance" value="0.5, 0.45, 0.4"/></bsdf></shape>
+<shape type="sphere"><point name="center" x="-0.9" y="1" z="0"/><float name="radius" value="0.9"/>MATERIAL</shape>
+<shape type="rectangle"><transform name="to_world"><scale value="0.9"/><rotate x="1" angle="-35"/><rotate y="1" angle="-15"/>
+<translate x="1.2" y="1" z="0.2"/></transform>MATERIAL</shape>
+</scene>
+"""
+
 
 def prepare(name: str, shared: Path, work: Path) -> Path:
     """Leaves the scene under `work` and returns its XML. Parameters: res (or resx, resy), spp, max_depth."""
@@ -29,7 +68,11 @@ def prepare(name: str, shared: Path, work: Path) -> Path:
         if not out.exists():  # 1,002,500 triangles
             subprocess.run([sys.executable, shared / "peers/make_scene.py", "148"], cwd=work, check=True)
         return out
-    raise SystemExit(f"unknown scene {name}; there are {', '.join(NAMES)}")
+    if name in MATERIALS:
+        out = work / f"material-{name}.xml"
+        out.write_text(SMALL.replace("MATERIAL", MATERIALS[name]))
+        return out
+    raise SystemExit(f"unknown scene {name}; there are {', '.join([*NAMES, *MATERIALS])}, and materials for all of these")
 
 
 def parameters(xml: Path, size: int, max_depth: int) -> dict:

@@ -1,16 +1,24 @@
 //! What surfaces are made of: the description of a material, and one BSDF a file.
 //!
 //! Scattering is computed in a local frame whose z axis is the shading normal on the side of `wo`, the direction back along the ray. Both
-//! directions point away from the surface; only reflection exists, so both have z above 0.
+//! directions point away from the surface: `wo` has z above 0, and so has what is reflected; what is transmitted has z below 0.
 
 mod conductor;
+mod dielectric;
 mod diffuse;
+mod plastic;
 mod rough;
 #[cfg(test)]
 mod tests;
 
 use glam::Vec3;
 use serde::{Deserialize, Serialize};
+
+pub use plastic::Transmittance;
+
+use dielectric::RoughInterface;
+use plastic::Coated;
+use rough::Rough;
 
 /// Microfacet distribution.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -51,6 +59,65 @@ pub enum Bsdf {
         /// Factor on the Fresnel reflectance.
         specular: [f32; 3],
     },
+    /// Smooth interface of a transparent solid.
+    Dielectric {
+        /// Index inside over outside, above 0.
+        eta: f32,
+        /// Factor on what is reflected.
+        reflect: [f32; 3],
+        /// Factor on what passes.
+        transmit: [f32; 3],
+    },
+    /// Thin pane of a transparent solid: what passes keeps its direction.
+    ThinDielectric {
+        /// Index inside over outside, above 0.
+        eta: f32,
+        /// Factor on what is reflected.
+        reflect: [f32; 3],
+        /// Factor on what passes.
+        transmit: [f32; 3],
+    },
+    /// Rough interface of a transparent solid, visible normals sampled.
+    RoughDielectric {
+        /// Distribution of normals.
+        distribution: Distribution,
+        /// Roughness along u and v, in (0, 1].
+        alpha: [f32; 2],
+        /// Index inside over outside, above 0; not 1.
+        eta: f32,
+        /// Factor on what is reflected.
+        reflect: [f32; 3],
+        /// Factor on what passes.
+        transmit: [f32; 3],
+    },
+    /// Diffuse base under a smooth coat.
+    Plastic {
+        /// Index of the coat over the outside, above 0.
+        eta: f32,
+        /// Albedo of the base.
+        diffuse: [f32; 3],
+        /// Factor on the coat's reflection.
+        specular: [f32; 3],
+        /// Light thrown back inside is coloured each time.
+        nonlinear: bool,
+    },
+    /// Diffuse base under a rough coat.
+    RoughPlastic {
+        /// Distribution of the coat's normals.
+        distribution: Distribution,
+        /// Roughness of the coat, in (0, 1].
+        alpha: f32,
+        /// Index of the coat over the outside, above 0.
+        eta: f32,
+        /// Albedo of the base.
+        diffuse: [f32; 3],
+        /// Factor on the coat's reflection.
+        specular: [f32; 3],
+        /// Light thrown back inside is coloured each time.
+        nonlinear: bool,
+        /// Of this distribution, roughness and index.
+        coat: Transmittance,
+    },
 }
 
 /// What a surface is made of.
@@ -78,46 +145,120 @@ impl Scatter {
     pub const NONE: Scatter = Scatter { value: Vec3::ZERO, pdf: 0.0 };
 }
 
+/// A direction sampled from a BSDF.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Sampled {
+    /// Local unit direction.
+    pub wi: Vec3,
+    /// Of a single direction, which [`Bsdf::eval`] does not know: BSDF times cosine over its probability. `None` where `eval` says it.
+    pub delta: Option<Vec3>,
+}
+
+impl Sampled {
+    fn smooth(wi: Vec3) -> Sampled {
+        Sampled { wi, delta: None }
+    }
+    fn delta(wi: Vec3, weight: Vec3) -> Sampled {
+        Sampled { wi, delta: Some(weight) }
+    }
+}
+
 impl Bsdf {
-    /// Whether it reflects to single directions: nothing but [`Bsdf::sample`] finds them, and [`Bsdf::delta_weight`] is their weight.
+    /// Whether it scatters to single directions only, so that sampling lights is of no use.
     #[inline(always)]
     pub fn is_delta(&self) -> bool {
+        matches!(self, Bsdf::Conductor { .. } | Bsdf::Dielectric { .. } | Bsdf::ThinDielectric { .. })
+    }
+
+    /// Whether every sample is the same direction.
+    #[inline(always)]
+    pub fn is_mirror(&self) -> bool {
         matches!(self, Bsdf::Conductor { .. })
+    }
+
+    /// Whether light passes through; then both sides of the surface count.
+    #[inline(always)]
+    pub fn transmits(&self) -> bool {
+        matches!(self, Bsdf::Dielectric { .. } | Bsdf::ThinDielectric { .. } | Bsdf::RoughDielectric { .. })
     }
 
     /// Whether the frame's tangents matter.
     #[inline(always)]
     pub fn is_anisotropic(&self) -> bool {
-        matches!(self, Bsdf::RoughConductor { alpha, .. } if alpha[0] != alpha[1])
+        match self {
+            Bsdf::RoughConductor { alpha, .. } | Bsdf::RoughDielectric { alpha, .. } => alpha[0] != alpha[1],
+            _ => false,
+        }
     }
 
-    /// Value and density for a pair of local unit directions.
+    /// Value and density for a pair of local unit directions; `front`: `wo` is on the surface's front side.
     #[inline(always)]
-    pub fn eval(&self, wo: Vec3, wi: Vec3) -> Scatter {
+    pub fn eval(&self, wo: Vec3, wi: Vec3, front: bool) -> Scatter {
         match self {
             Bsdf::Diffuse { reflectance } => diffuse::eval(*reflectance, wo, wi),
-            Bsdf::Conductor { .. } => Scatter::NONE,
+            Bsdf::Conductor { .. } | Bsdf::Dielectric { .. } | Bsdf::ThinDielectric { .. } => Scatter::NONE,
             Bsdf::RoughConductor { distribution, alpha, eta, k, specular } => {
-                rough::Rough::new(*distribution, *alpha).eval(wo, wi, |cos| conductor::fresnel(cos, eta, k, specular))
+                Rough::new(*distribution, *alpha).eval(wo, wi, |cos| conductor::fresnel(cos, eta, k, specular))
+            }
+            Bsdf::RoughDielectric { .. } => self.interface(front).map_or(Scatter::NONE, |i| i.eval(wo, wi)),
+            Bsdf::Plastic { .. } => self.coated().map_or(Scatter::NONE, |c| c.eval_smooth(wo, wi)),
+            Bsdf::RoughPlastic { distribution, alpha, coat, .. } => self
+                .coated()
+                .map_or(Scatter::NONE, |c| c.eval_rough(&Rough::new(*distribution, [*alpha; 2]), coat, wo, wi)),
+        }
+    }
+
+    /// Local `wi` for two numbers and one that chooses between parts, in [0, 1); `None` when it would lie on the wrong side of the surface: that
+    /// sample is worth 0.
+    #[inline(always)]
+    pub fn sample(&self, wo: Vec3, front: bool, u: [f32; 2], lobe: f32) -> Option<Sampled> {
+        match self {
+            Bsdf::Diffuse { .. } => diffuse::sample(wo, u).map(Sampled::smooth),
+            Bsdf::Conductor { eta, k, specular } => (wo.z > 0.0)
+                .then(|| Sampled::delta(Vec3::new(-wo.x, -wo.y, wo.z), conductor::fresnel(wo.z, eta, k, specular))),
+            Bsdf::RoughConductor { distribution, alpha, .. } => {
+                Rough::new(*distribution, *alpha).sample(wo, u).map(Sampled::smooth)
+            }
+            Bsdf::Dielectric { eta, reflect, transmit } => {
+                dielectric::sample_smooth(wo, relative(*eta, front), *reflect, *transmit, lobe)
+            }
+            Bsdf::ThinDielectric { eta, reflect, transmit } => {
+                dielectric::sample_thin(wo, *eta, *reflect, *transmit, lobe)
+            }
+            Bsdf::RoughDielectric { .. } => self.interface(front)?.sample(wo, u, lobe),
+            Bsdf::Plastic { .. } => self.coated()?.sample_smooth(wo, u, lobe),
+            Bsdf::RoughPlastic { distribution, alpha, coat, .. } => {
+                self.coated()?.sample_rough(&Rough::new(*distribution, [*alpha; 2]), coat, wo, u, lobe)
             }
         }
     }
 
-    /// Local `wi` for two numbers in [0, 1); `None` when it would lie below the surface: that sample is worth 0.
-    #[inline(always)]
-    pub fn sample(&self, wo: Vec3, u: [f32; 2]) -> Option<Vec3> {
-        match self {
-            Bsdf::Diffuse { .. } => diffuse::sample(wo, u),
-            Bsdf::Conductor { .. } => (wo.z > 0.0).then(|| Vec3::new(-wo.x, -wo.y, wo.z)),
-            Bsdf::RoughConductor { distribution, alpha, .. } => rough::Rough::new(*distribution, *alpha).sample(wo, u),
-        }
+    fn interface(&self, front: bool) -> Option<RoughInterface> {
+        let Bsdf::RoughDielectric { distribution, alpha, eta, reflect, transmit } = self else { return None };
+        Some(RoughInterface {
+            rough: Rough::new(*distribution, *alpha),
+            eta: relative(*eta, front),
+            reflect: (*reflect).into(),
+            transmit: (*transmit).into(),
+        })
     }
 
-    /// Weight of a delta reflection: BSDF times cosine over the probability.
-    pub fn delta_weight(&self, wo: Vec3) -> Vec3 {
+    fn coated(&self) -> Option<Coated> {
         match self {
-            Bsdf::Conductor { eta, k, specular } => conductor::fresnel(wo.z, eta, k, specular),
-            _ => Vec3::ZERO,
+            Bsdf::Plastic { eta, diffuse, specular, nonlinear }
+            | Bsdf::RoughPlastic { eta, diffuse, specular, nonlinear, .. } => Some(Coated {
+                eta: *eta,
+                diffuse: (*diffuse).into(),
+                specular: (*specular).into(),
+                nonlinear: *nonlinear,
+            }),
+            _ => None,
         }
     }
+}
+
+/// Index beyond the surface over the index on this side.
+#[inline(always)]
+fn relative(eta: f32, front: bool) -> f32 {
+    if front { eta } else { 1.0 / eta }
 }

@@ -46,6 +46,13 @@ impl Rough {
     }
 
     pub(super) fn sample(&self, wo: Vec3, u: [f32; 2]) -> Option<Vec3> {
+        let m = self.visible_normal(wo, u)?;
+        let wi = m * (2.0 * wo.dot(m)) - wo;
+        (wi.z > 0.0).then(|| wi / wi.length())
+    }
+
+    /// A microfacet normal of unit length, of density `density(m) masking(wo) (wo . m) / wo.z` in solid angle.
+    pub(super) fn visible_normal(&self, wo: Vec3, u: [f32; 2]) -> Option<Vec3> {
         if !(wo.z > 0.0) {
             return None;
         }
@@ -59,13 +66,11 @@ impl Rough {
         // and back
         let m = Vec3::new(self.ax * m.x, self.ay * m.y, m.z.max(0.0));
         let length = m.length();
-        let m = m / length;
-        let wi = m * (2.0 * wo.dot(m)) - wo;
-        (length > 0.0 && wi.z > 0.0).then(|| wi / wi.length())
+        (length > 0.0).then(|| m / length)
     }
 
     /// D(m).
-    fn density(&self, m: Vec3) -> f32 {
+    pub(super) fn density(&self, m: Vec3) -> f32 {
         if !(m.z > 0.0) {
             return 0.0;
         }
@@ -86,8 +91,8 @@ impl Rough {
         }
     }
 
-    /// Smith's G1(w) = 1 / (1 + Lambda(w)), for normals on the side of `w`.
-    fn masking(&self, w: Vec3) -> f32 {
+    /// Smith's G1(w) = 1 / (1 + Lambda(w)), for normals on the side of `w`; of `w` below the surface that of its mirror image.
+    pub(super) fn masking(&self, w: Vec3) -> f32 {
         let (x, y) = (self.ax * w.x, self.ay * w.y);
         let tan2 = (x * x + y * y) / (w.z * w.z);
         if !(tan2 > 0.0) {

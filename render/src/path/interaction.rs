@@ -117,6 +117,12 @@ impl Interaction {
         offset_origin(&self.position, self.normal)
     }
 
+    /// Origin of every ray that leaves on the other side.
+    #[inline(always)]
+    pub(super) fn origin_beyond(&self) -> Vec3 {
+        offset_origin(&self.position, -self.normal)
+    }
+
     /// The shading frame; its tangents follow the surface's parametrisation when `tangents` asks for it.
     #[inline(always)]
     pub(super) fn basis(&self, surface: &Surface, tangents: bool) -> Basis {

@@ -9,7 +9,7 @@ use super::{Context, Contribution, Outcome, PathRay, ShadowRay, Surface, Surface
 use crate::material::Bsdf;
 use crate::math::{UnitDir, unit};
 use crate::ray::{Hit, PathKey, PrimId, Ray};
-use crate::sampler::{BSDF, LIGHT, LIGHT_CHOICE, ROULETTE, Stream};
+use crate::sampler::{BSDF, LIGHT, LIGHT_CHOICE, LOBE, ROULETTE, Stream};
 use crate::world::Primitive;
 
 /// Shades each ray with its hit and appends what comes of it to `out`.
@@ -141,7 +141,7 @@ fn arrive(
     };
     let throughput = Vec3::from(ray.throughput);
     // a mirror would send every sibling the same way
-    if number == 1 && frame.split > 1 && !material.bsdf.is_delta() {
+    if number == 1 && frame.split > 1 && !material.bsdf.is_mirror() {
         let share = throughput / frame.split as f32;
         for child in 0..frame.split {
             let key = PathKey { branch: child as u16, ..ray.key };
@@ -185,7 +185,7 @@ pub(super) fn scatter_plain(
     let material = &context.world.materials[context.world.shapes[surface.shape as usize].material as usize];
     let d = Vec3::from(ray.dir.decode());
     let at = match Interaction::new(Vec3::from(ray.o), d, hit, surface) {
-        Some(at) if at.from_front || material.two_sided => at,
+        Some(at) if at.from_front || material.two_sided || material.bsdf.transmits() => at,
         _ => {
             out.counters.absorbed += 1;
             return;
@@ -203,77 +203,94 @@ pub(super) fn scatter_plain(
     let go_on = unit(numbers[ROULETTE]);
     let siblings = frame.split as f32;
 
-    let light = if material.bsdf.is_delta() {
-        None
-    } else {
-        context.lights.sample(origin, numbers[LIGHT_CHOICE], [unit(numbers[LIGHT]), unit(numbers[LIGHT + 1])])
-    };
-    let shadow = |dir: UnitDir, tmax: f32, contribution: Vec3, out: &mut Outcome| {
+    let place = [unit(numbers[LIGHT]), unit(numbers[LIGHT + 1])];
+    let light =
+        if material.bsdf.is_delta() { None } else { context.lights.sample(origin, numbers[LIGHT_CHOICE], place) };
+    let shadow = |o: Vec3, dir: UnitDir, tmax: f32, contribution: Vec3, out: &mut Outcome| {
         if contribution != Vec3::ZERO {
-            let ray = ShadowRay { o: origin.to_array(), dir, tmax, contribution: contribution.to_array(), key };
+            let ray = ShadowRay { o: o.to_array(), dir, tmax, contribution: contribution.to_array(), key };
             out.shadow.push(ray);
             out.shadow_rays.push(ray.ray());
         }
     };
 
-    let (dir, throughput, pdf, fate) = if let (Bsdf::Diffuse { reflectance }, true) = (&material.bsdf, at.is_flat()) {
+    let (o, dir, throughput, pdf, fate) = if let (Bsdf::Diffuse { reflectance }, true) = (&material.bsdf, at.is_flat())
+    {
         let reflectance = Vec3::from(*reflectance);
         if let Some(light) = light {
             let (dir, _, contribution) =
                 towards_light(throughput, reflectance, at.normal, light.d, light.pdf, light.radiance, true);
-            shadow(dir, light.tmax, contribution, out);
+            shadow(origin, dir, light.tmax, contribution, out);
         }
         let (dir, _, throughput, pdf, fate) =
             onwards(throughput, reflectance, at.normal, direction, go_on, roulette, siblings);
-        (dir, throughput, pdf, fate)
+        (origin, dir, throughput, pdf, fate)
     } else {
         let bsdf = &material.bsdf;
         let basis = at.basis(surface, bsdf.is_anisotropic());
         let wo = basis.to_local(-d);
+        // a light behind a surface that lets light through is sampled from there
+        let (from, light) = match light {
+            Some(light) if bsdf.transmits() && light.d.dot(at.normal) < 0.0 => {
+                let beyond = at.origin_beyond();
+                (beyond, context.lights.sample(beyond, numbers[LIGHT_CHOICE], place))
+            }
+            light => (origin, light),
+        };
         if let Some(light) = light {
             let dir = UnitDir::encode(light.d.to_array());
             let wi = Vec3::from(dir.decode());
+            let local = basis.to_local(wi);
             // by the geometric normal too, or light would leak through the surface
-            if wi.dot(at.normal) > 0.0 {
-                let scattered = bsdf.eval(wo, basis.to_local(wi));
+            if same_side(wi.dot(at.normal), local.z, bsdf.transmits()) {
+                let scattered = bsdf.eval(wo, local, at.from_front);
                 let weight = power_heuristic(light.pdf, scattered.pdf) / light.pdf;
-                shadow(dir, light.tmax, throughput * scattered.value * light.radiance * weight, out);
+                shadow(from, dir, light.tmax, throughput * scattered.value * light.radiance * weight, out);
             }
         }
-        let Some(wi) = bsdf.sample(wo, direction) else {
+        let Some(sampled) = bsdf.sample(wo, at.from_front, direction, unit(numbers[LOBE])) else {
             out.counters.absorbed += 1;
             return;
         };
-        let dir = UnitDir::encode(basis.to_world(wi).to_array());
+        let dir = UnitDir::encode(basis.to_world(sampled.wi).to_array());
         let wi = Vec3::from(dir.decode());
-        // of the direction as it travels
-        let (weight, pdf) = if bsdf.is_delta() {
-            (bsdf.delta_weight(wo), 0.0)
-        } else {
-            let scattered = bsdf.eval(wo, basis.to_local(wi));
-            (scattered.value / scattered.pdf, scattered.pdf)
+        let (weight, pdf) = match sampled.delta {
+            Some(weight) => (weight, 0.0),
+            // of the direction as it travels
+            None => {
+                let scattered = bsdf.eval(wo, basis.to_local(wi), at.from_front);
+                (scattered.value / scattered.pdf, scattered.pdf)
+            }
         };
         let throughput = throughput * weight;
         let largest = throughput.max_element();
         // siblings are as likely to go on as an only child
         let chance = if roulette { (largest * siblings).min(0.95) } else { 1.0 };
+        let o = if sampled.wi.z < 0.0 { at.origin_beyond() } else { origin };
         // false for NaN: 0 / 0 of a direction that snapping took below the horizon
-        let fate = if !(wi.dot(at.normal) > 0.0 && largest > 0.0) {
+        let fate = if !(same_side(wi.dot(at.normal), sampled.wi.z, bsdf.transmits()) && largest > 0.0) {
             Fate::Absorbed
         } else if go_on >= chance {
             Fate::Roulette
         } else {
             Fate::On
         };
-        (dir, throughput / chance, pdf, fate)
+        (o, dir, throughput / chance, pdf, fate)
     };
     match fate {
         Fate::On => {
-            let ray = PathRay { o: origin.to_array(), dir, key: next_key, throughput: throughput.to_array(), pdf };
+            let ray = PathRay { o: o.to_array(), dir, key: next_key, throughput: throughput.to_array(), pdf };
             out.next.push(ray);
             out.next_rays.push(ray.ray());
         }
         Fate::Absorbed => out.counters.absorbed += 1,
         Fate::Roulette => out.counters.roulette += 1,
     }
+}
+
+/// Whether a direction of cosine `geometric` to the geometric normal and `shading` to the shading normal leaves on one side by both; on the far side
+/// only from a surface that transmits.
+#[inline(always)]
+fn same_side(geometric: f32, shading: f32, transmits: bool) -> bool {
+    (geometric > 0.0 && (shading > 0.0 || !transmits)) || (transmits && geometric < 0.0 && shading < 0.0)
 }

@@ -12,6 +12,7 @@ mod obj;
 mod options;
 mod placement;
 mod ply;
+mod refraction;
 mod shapes;
 mod source;
 mod spill;

@@ -285,8 +285,20 @@ fn nothing_is_nan() {
     let sizes = [0.0, 1e-30, 1e-6, 1.0, 1e6];
     for i in 0..5_000 {
         let mut scene = Scene { environment: (i % 3 == 0).then_some([1.0; 3]), ..Scene::default() };
-        let bsdf = match i % 4 {
+        let glass = [[1e-4, 0.1, 1.0][i % 3], [1e-4, 0.1, 1.0][i / 3 % 3]];
+        let (eta, white) = ([1.5, 1.0, 0.7][i / 9 % 3], [1.0; 3]);
+        let bsdf = match i % 8 {
             0 => Bsdf::Diffuse { reflectance: [rng.f32(), 0.0, 1.0] },
+            4 => Bsdf::Dielectric { eta, reflect: white, transmit: white },
+            5 => Bsdf::ThinDielectric { eta, reflect: white, transmit: white },
+            6 => Bsdf::RoughDielectric {
+                distribution: Distribution::Ggx,
+                alpha: glass,
+                eta,
+                reflect: white,
+                transmit: white,
+            },
+            7 => Bsdf::Plastic { eta, diffuse: white, specular: white, nonlinear: true },
             1 => Bsdf::Conductor { eta: [0.2; 3], k: [3.0; 3], specular: [1.0; 3] },
             j => Bsdf::RoughConductor {
                 distribution: if j == 2 { Distribution::Beckmann } else { Distribution::Ggx },

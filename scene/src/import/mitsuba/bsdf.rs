@@ -76,6 +76,8 @@ impl Converter<'_> {
                 self.ignore(id, &["sample_visible"]);
                 (Bsdf::RoughConductor { distribution, alpha, eta, k, specular }, false)
             }
+            plugin @ ("dielectric" | "thindielectric" | "roughdielectric") => (self.transparent(id, plugin)?, false),
+            plugin @ ("plastic" | "roughplastic") => (self.plastic(id, plugin)?, false),
             plugin @ ("bumpmap" | "normalmap" | "mask" | "opacity") => {
                 self.unsupported(place, format!("bsdf \"{plugin}\""), "the material inside");
                 let inner = self.nested(id, "bsdf")?;
@@ -85,7 +87,7 @@ impl Converter<'_> {
                     [] => return malformed(place, format!("{plugin} needs a material inside")),
                 }
             }
-            plugin @ ("plastic" | "roughplastic" | "roughdiffuse" | "phong" | "ward" | "principled") => {
+            plugin @ ("roughdiffuse" | "phong" | "ward" | "principled") => {
                 self.unsupported(place, format!("bsdf \"{plugin}\""), "diffuse of its diffuse colour, two-sided");
                 object.properties.iter().for_each(|p| p.used.set(true));
                 let name =
@@ -107,7 +109,7 @@ impl Converter<'_> {
     }
 
     /// A colour in [0, 1].
-    fn albedo(&mut self, id: ObjectId, name: &str) -> Result<Option<[f32; 3]>, ImportError> {
+    pub(super) fn albedo(&mut self, id: ObjectId, name: &str) -> Result<Option<[f32; 3]>, ImportError> {
         let Some(rgb) = self.color(id, name, DEFAULT_REFLECTANCE.into())? else { return Ok(None) };
         if rgb.iter().any(|v| !(0.0..=1.0).contains(v)) {
             let place = &self.document.objects[id].place;
@@ -149,7 +151,7 @@ impl Converter<'_> {
         Ok((eta.map(|v| (v / outside) as f32), k.map(|v| (v / outside) as f32)))
     }
 
-    fn distribution(&mut self, id: ObjectId) -> Result<Distribution, ImportError> {
+    pub(super) fn distribution(&mut self, id: ObjectId) -> Result<Distribution, ImportError> {
         match self.string(id, "distribution")? {
             None => Ok(Distribution::Beckmann),
             Some((name, at)) => match name.to_ascii_lowercase().as_str() {
@@ -163,7 +165,7 @@ impl Converter<'_> {
         }
     }
 
-    fn roughness(&mut self, id: ObjectId) -> Result<[f32; 2], ImportError> {
+    pub(super) fn roughness(&mut self, id: ObjectId) -> Result<[f32; 2], ImportError> {
         let place = &self.document.objects[id].place;
         let mut get = |name: &str| -> Result<Option<f64>, ImportError> { Ok(self.color(id, name, 0.1)?.map(|v| v[0])) };
         let alpha = match (get("alpha")?, get("alpha_u")?, get("alpha_v")?) {
@@ -183,5 +185,10 @@ fn bsdf_name(bsdf: &Bsdf) -> &'static str {
         Bsdf::Diffuse { .. } => "diffuse",
         Bsdf::Conductor { .. } => "conductor",
         Bsdf::RoughConductor { .. } => "roughconductor",
+        Bsdf::Dielectric { .. } => "dielectric",
+        Bsdf::ThinDielectric { .. } => "thindielectric",
+        Bsdf::RoughDielectric { .. } => "roughdielectric",
+        Bsdf::Plastic { .. } => "plastic",
+        Bsdf::RoughPlastic { .. } => "roughplastic",
     }
 }

@@ -15,6 +15,7 @@
 //!   front of mirrored meshes that have no normals.
 
 mod bsdf;
+mod coats;
 mod emitter;
 mod scene;
 mod sensor;

@@ -313,7 +313,7 @@ fn colours() {
 fn all_that_is_unsupported_is_listed() {
     let text = "<integrator type=\"path\"><boolean name=\"hide_emitters\" value=\"true\"/></integrator>\n\
          <sensor type=\"fisheye\"/>\n\
-         <bsdf type=\"plastic\" id=\"p\"/>\n\
+         <bsdf type=\"ward\" id=\"p\"/>\n\
          <bsdf type=\"diffuse\" id=\"d\"><texture name=\"reflectance\" type=\"bitmap\"/></bsdf>\n\
          <shape type=\"hair\"/>\n\
          <shape type=\"cube\"><ref id=\"p\"/><medium name=\"interior\" type=\"homogeneous\"/></shape>\n\
@@ -328,7 +328,7 @@ fn all_that_is_unsupported_is_listed() {
         [
             (2, "hide_emitters"),
             (3, "sensor \"fisheye\""),
-            (4, "bsdf \"plastic\""),
+            (4, "bsdf \"ward\""),
             (5, "texture \"bitmap\" for \"reflectance\""),
             (6, "shape \"hair\""),
             (7, "medium \"homogeneous\" in shape \"cube\""),
@@ -429,4 +429,56 @@ fn what_is_wrong_has_file_line_and_remedy() {
     let attributes: String = (0..20_000).map(|i| format!(" a{i}=\"\"")).collect();
     assert!(message(&format!("<shape{attributes}/>")).contains("attributes"));
     assert!(message("<!DOCTYPE x [<!ENTITY a \"b\">]>").contains("well-formed"));
+}
+
+#[test]
+fn glass_and_plastic() {
+    let bsdf = |text: &str| -> Result<Bsdf, ImportError> {
+        let text = format!("<shape type=\"sphere\"><bsdf {text}</bsdf></shape>");
+        scene(&text).map(|s| s.materials[0].bsdf.clone())
+    };
+    let eta = |b: Bsdf| match b {
+        Bsdf::Dielectric { eta, .. } | Bsdf::ThinDielectric { eta, .. } | Bsdf::RoughDielectric { eta, .. } => eta,
+        Bsdf::Plastic { eta, .. } | Bsdf::RoughPlastic { eta, .. } => eta,
+        other => panic!("{other:?}"),
+    };
+    // as mitsuba 3.9.1 has them
+    for (text, expected) in [
+        ("type=\"dielectric\">", 1.5046 / 1.000277),
+        ("type=\"thindielectric\"><string name=\"int_ior\" value=\"Water\"/>", 1.333 / 1.000277),
+        ("type=\"roughdielectric\"><float name=\"intIOR\" value=\"1.8\"/><float name=\"ext_ior\" value=\"1.2\"/>", 1.5),
+        ("type=\"plastic\">", 1.49 / 1.000277),
+        (
+            "type=\"roughplastic\"><integer name=\"int_ior\" value=\"2\"/><string name=\"ext_ior\" value=\"vacuum\"/>",
+            2.0,
+        ),
+    ] {
+        let found = eta(bsdf(text).unwrap());
+        assert!((f64::from(found) - expected).abs() < 1e-6, "{text}: {found}");
+    }
+    let plastic = bsdf(
+        "type=\"plastic\"><rgb name=\"diffuse_reflectance\" value=\"0.1, 0.2, 0.3\"/><boolean name=\"nonlinear\" value=\"true\"/>",
+    )
+    .unwrap();
+    let Bsdf::Plastic { diffuse, specular, nonlinear, .. } = plastic else { panic!("{plastic:?}") };
+    assert_eq!((diffuse, specular, nonlinear), ([0.1, 0.2, 0.3], [1.0; 3], true));
+    let same = "type=\"roughdielectric\"><float name=\"int_ior\" value=\"1\"/><float name=\"ext_ior\" value=\"1\"/>\
+        <float name=\"alpha\" value=\"0.3\"/>";
+    assert!(matches!(bsdf(same).unwrap(), Bsdf::Dielectric { eta: 1.0, .. }));
+    for (text, what) in [
+        (
+            "type=\"dielectric\"><string name=\"int_ior\" value=\"glass\"/>",
+            "no index of refraction is known for \"glass\"; there are vacuum,",
+        ),
+        ("type=\"dielectric\"><float name=\"int_ior\" value=\"0\"/>", "should lie between 0.1 and 10"),
+        ("type=\"plastic\"><float name=\"int_ior\" value=\"-1\"/>", "should lie between 0.1 and 10"),
+        (
+            "type=\"roughplastic\"><float name=\"alpha_u\" value=\"0.1\"/><float name=\"alpha_v\" value=\"0.2\"/>",
+            "isotropic",
+        ),
+        ("type=\"plastic\"><rgb name=\"diffuse_reflectance\" value=\"1.5\"/>", "in [0, 1]"),
+    ] {
+        let error = bsdf(text).unwrap_err().to_string();
+        assert!(error.contains(what), "{text}: {error}");
+    }
 }

@@ -1,0 +1,111 @@
+//! Interfaces between two transparent media: smooth, thin (a pane), rough.
+//!
+//! A rough interface is the model of Walter et al. 2007, "Microfacet Models for Refraction through Rough Surfaces", with visible normals
+//! sampled. Radiance is divided by the square of the relative index when it crosses (Veach 1997, section 5.2), as a path from the
+//! camera needs it.
+
+use glam::Vec3;
+
+use super::rough::Rough;
+use super::{Sampled, Scatter};
+
+/// Unpolarised reflectance and the cosine of the refracted ray, for a ray at cosine `cos` (in [0, 1]) in a medium from which the other
+/// side has index `eta` (Born and Wolf, section 1.5). Total reflection: (1, 0).
+#[inline]
+pub(super) fn fresnel(cos: f32, eta: f32) -> (f32, f32) {
+    if eta == 1.0 {
+        return (0.0, cos);
+    }
+    let cos = cos.clamp(0.0, 1.0);
+    let inv = 1.0 / eta;
+    let cos2_t = 1.0 - (1.0 - cos * cos) * (inv * inv);
+    if !(cos2_t > 0.0) {
+        return (1.0, 0.0);
+    }
+    let cos_t = cos2_t.sqrt();
+    let s = (cos - eta * cos_t) / (cos + eta * cos_t);
+    let p = (eta * cos - cos_t) / (eta * cos + cos_t);
+    ((0.5 * (s * s + p * p)).min(1.0), cos_t)
+}
+
+/// A smooth interface: a mirror's direction or the refracted one, by their shares of the energy.
+pub(super) fn sample_smooth(wo: Vec3, eta: f32, reflect: [f32; 3], transmit: [f32; 3], lobe: f32) -> Option<Sampled> {
+    if !(wo.z > 0.0) {
+        return None;
+    }
+    let (r, cos_t) = fresnel(wo.z, eta);
+    if lobe < r {
+        return Some(Sampled::delta(Vec3::new(-wo.x, -wo.y, wo.z), reflect.into()));
+    }
+    let inv = 1.0 / eta;
+    let wi = Vec3::new(-wo.x * inv, -wo.y * inv, -cos_t);
+    (cos_t > 0.0).then(|| Sampled::delta(wi / wi.length(), Vec3::from(transmit) * (inv * inv)))
+}
+
+/// A pane with parallel faces, all reflections inside summed: r + t r t + t r^3 t + .. = 2 r / (1 + r); what passes keeps its direction.
+pub(super) fn sample_thin(wo: Vec3, eta: f32, reflect: [f32; 3], transmit: [f32; 3], lobe: f32) -> Option<Sampled> {
+    if !(wo.z > 0.0) {
+        return None;
+    }
+    let (r, _) = fresnel(wo.z, eta);
+    let r = 2.0 * r / (1.0 + r);
+    Some(if lobe < r {
+        Sampled::delta(Vec3::new(-wo.x, -wo.y, wo.z), reflect.into())
+    } else {
+        Sampled::delta(-wo, transmit.into())
+    })
+}
+
+/// A rough interface; `eta` is the index beyond it over the index on the side of `wo`.
+pub(super) struct RoughInterface {
+    pub rough: Rough,
+    pub eta: f32,
+    pub reflect: Vec3,
+    pub transmit: Vec3,
+}
+
+impl RoughInterface {
+    pub(super) fn eval(&self, wo: Vec3, wi: Vec3) -> Scatter {
+        if !(wo.z > 0.0 && wi.z != 0.0) {
+            return Scatter::NONE;
+        }
+        let reflects = wi.z > 0.0;
+        let m = if reflects { wo + wi } else { wo + wi * self.eta };
+        let length = m.length();
+        let m = m / if m.z < 0.0 { -length } else { length };
+        let (cos_o, cos_i) = (wo.dot(m), wi.dot(m));
+        // facets seen from the back neither reflect nor refract; nor do equal indices bend anything (length 0: NaN)
+        if !(length > 0.0 && cos_o > 0.0 && m.z > 0.0 && (cos_i > 0.0) == reflects) {
+            return Scatter::NONE;
+        }
+        let (r, _) = fresnel(cos_o, self.eta);
+        // density of the visible normals over their cosine to `wo`
+        let visible = self.rough.density(m) * self.rough.masking(wo) / wo.z;
+        let shadowing = self.rough.masking(wi);
+        if reflects {
+            let pdf = r * visible / 4.0;
+            return Scatter { value: self.reflect * (pdf * shadowing), pdf };
+        }
+        let sum = cos_o + self.eta * cos_i;
+        // Walter et al., equation 17
+        let jacobian = self.eta * self.eta * -cos_i / (sum * sum);
+        let pdf = (1.0 - r) * visible * cos_o * jacobian;
+        if !(pdf > 0.0 && pdf.is_finite()) {
+            return Scatter::NONE;
+        }
+        Scatter { value: self.transmit * (pdf * shadowing / (self.eta * self.eta)), pdf }
+    }
+
+    pub(super) fn sample(&self, wo: Vec3, u: [f32; 2], lobe: f32) -> Option<Sampled> {
+        let m = self.rough.visible_normal(wo, u)?;
+        let cos = wo.dot(m);
+        let (r, cos_t) = fresnel(cos, self.eta);
+        if lobe < r {
+            let wi = m * (2.0 * cos) - wo;
+            return (wi.z > 0.0).then(|| Sampled::smooth(wi / wi.length()));
+        }
+        let inv = 1.0 / self.eta;
+        let wi = m * (cos * inv - cos_t) - wo * inv;
+        (wi.z < 0.0 && cos_t > 0.0).then(|| Sampled::smooth(wi / wi.length()))
+    }
+}

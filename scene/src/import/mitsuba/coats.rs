@@ -1,0 +1,81 @@
+//! Transparent materials and plastics.
+
+use super::Converter;
+use super::xml::{ObjectId, Value, malformed};
+use crate::ImportError;
+use crate::description::{Bsdf, Transmittance};
+use crate::import::refraction;
+
+/// Largest ratio of indices; diamond in vacuum has 2.4, and beyond 10 the reflectance of diffuse light is not known well enough.
+const LARGEST: f64 = 10.0;
+
+impl Converter<'_> {
+    /// `dielectric`, `thindielectric` and `roughdielectric`.
+    pub(super) fn transparent(&mut self, id: ObjectId, plugin: &str) -> Result<Bsdf, ImportError> {
+        let eta = self.relative_index(id, "bk7")?;
+        let reflect = self.albedo(id, "specular_reflectance")?.unwrap_or([1.0; 3]);
+        let transmit = self.albedo(id, "specular_transmittance")?.unwrap_or([1.0; 3]);
+        Ok(match plugin {
+            "thindielectric" => Bsdf::ThinDielectric { eta, reflect, transmit },
+            // equal indices bend nothing, however rough
+            "roughdielectric" if eta != 1.0 => {
+                let (distribution, alpha) = (self.distribution(id)?, self.roughness(id)?);
+                self.ignore(id, &["sample_visible"]);
+                Bsdf::RoughDielectric { distribution, alpha, eta, reflect, transmit }
+            }
+            "roughdielectric" => {
+                self.ignore(id, &["sample_visible", "distribution", "alpha", "alpha_u", "alpha_v"]);
+                Bsdf::Dielectric { eta, reflect, transmit }
+            }
+            _ => Bsdf::Dielectric { eta, reflect, transmit },
+        })
+    }
+
+    /// `plastic` and `roughplastic`.
+    pub(super) fn plastic(&mut self, id: ObjectId, plugin: &str) -> Result<Bsdf, ImportError> {
+        let eta = self.relative_index(id, "polypropylene")?;
+        let diffuse = self.albedo(id, "diffuse_reflectance")?.unwrap_or([0.5; 3]);
+        let specular = self.albedo(id, "specular_reflectance")?.unwrap_or([1.0; 3]);
+        let nonlinear = self.boolean(id, "nonlinear")?.unwrap_or(false);
+        if plugin == "plastic" {
+            return Ok(Bsdf::Plastic { eta, diffuse, specular, nonlinear });
+        }
+        let distribution = self.distribution(id)?;
+        let [alpha, other] = self.roughness(id)?;
+        if alpha != other {
+            let place = &self.document.objects[id].place;
+            return malformed(place, "a rough plastic is isotropic: give alpha");
+        }
+        self.ignore(id, &["sample_visible"]);
+        let coat = Transmittance::new(distribution, alpha, eta);
+        Ok(Bsdf::RoughPlastic { distribution, alpha, eta, diffuse, specular, nonlinear, coat })
+    }
+
+    /// `int_ior` over `ext_ior` (air), each a number or a name.
+    fn relative_index(&mut self, id: ObjectId, inside: &str) -> Result<f32, ImportError> {
+        let inside = self.index(id, "int_ior", inside)?;
+        let outside = self.index(id, "ext_ior", "air")?;
+        let eta = inside / outside;
+        if !(1.0 / LARGEST..=LARGEST).contains(&eta) {
+            let place = &self.document.objects[id].place;
+            return malformed(place, format!("int_ior over ext_ior is {eta}; it should lie between 0.1 and 10"));
+        }
+        Ok(eta as f32)
+    }
+
+    fn index(&mut self, id: ObjectId, property: &str, default: &str) -> Result<f64, ImportError> {
+        let Some(p) = self.property(id, property) else { return Ok(refraction::find(default).unwrap_or(1.0)) };
+        match &p.value {
+            Value::Float(v) => Ok(*v),
+            Value::Integer(v) => Ok(*v as f64),
+            Value::String(name) => match refraction::find(name) {
+                Some(v) => Ok(v),
+                None => malformed(
+                    &p.place,
+                    format!("no index of refraction is known for \"{name}\"; there are {}", refraction::names()),
+                ),
+            },
+            _ => malformed(&p.place, format!("\"{property}\" should be a <float> or a <string>")),
+        }
+    }
+}
