@@ -7,6 +7,7 @@ use rayherd_render::attributes::AttributeBlock;
 use rayherd_render::bvh::Forest;
 use rayherd_render::path::{Surface, Surfaces};
 use rayherd_render::ray::{Hit, PrimId};
+use rayherd_render::world::Primitive;
 use rayherd_scene::grid::SplitSet;
 
 use crate::job::{JobError, PreparedScene};
@@ -129,12 +130,18 @@ impl Attributes {
         Attributes { block, starts: Some(starts), shapes }
     }
 
-    #[inline]
+    #[inline(always)]
     fn shape(&self, local: usize) -> u32 {
         match &self.starts {
             Some(starts) => self.shapes[starts.partition_point(|&s| s as usize <= local)],
             None => self.block.shapes[local],
         }
+    }
+
+    #[inline(always)]
+    fn normals(&self, local: usize) -> Option<[[f32; 3]; 3]> {
+        // zeros: this one has none
+        self.block.normals.get(local).copied().filter(|n| n.as_flattened().iter().any(|&x| x != 0.0))
     }
 }
 
@@ -144,21 +151,37 @@ pub struct ResidentSurfaces<'a> {
     attributes: &'a [Attributes],
 }
 
-impl Surfaces for ResidentSurfaces<'_> {
+impl ResidentSurfaces<'_> {
+    /// Attributes of the split of a primitive, and its local index.
     #[inline(always)]
+    fn at(&self, slot: u32) -> (&Attributes, usize) {
+        let block = self.resident.block_of(slot);
+        (&self.attributes[block], (slot - self.resident.blocks[block].0) as usize)
+    }
+}
+
+impl Surfaces for ResidentSurfaces<'_> {
+    #[inline]
     fn surface(&self, _index: usize, hit: &Hit) -> Surface {
-        let forest = &self.resident.forest;
-        let block = self.resident.block_of(hit.prim);
-        let local = (hit.prim - self.resident.blocks[block].0) as usize;
-        let attributes = &self.attributes[block];
-        // zeros: this one has none
-        let normals =
-            attributes.block.normals.get(local).copied().filter(|n| n.as_flattened().iter().any(|&x| x != 0.0));
+        let (attributes, local) = self.at(hit.prim);
         Surface {
             shape: attributes.shape(local),
-            geometry: forest.primitive(hit),
-            normals,
+            geometry: self.resident.forest.primitive(hit),
+            normals: attributes.normals(local),
             uv: attributes.block.uvs.get(local).copied(),
+        }
+    }
+    #[inline(always)]
+    fn shape(&self, _index: usize, hit: &Hit) -> u32 {
+        let (attributes, local) = self.at(hit.prim);
+        attributes.shape(local)
+    }
+    #[inline(always)]
+    fn flat_triangle(&self, _index: usize, hit: &Hit) -> Option<[[f32; 3]; 3]> {
+        let (attributes, local) = self.at(hit.prim);
+        match self.resident.forest.primitive(hit) {
+            Primitive::Triangle(vertices) if attributes.normals(local).is_none() => Some(vertices),
+            _ => None,
         }
     }
     fn prim(&self, _index: usize, hit: &Hit) -> PrimId {

@@ -29,6 +29,10 @@ pub trait Stop {
     fn check(&self) -> Result<(), JobError>;
 }
 
+/// Most rays of a batch: with hits and what comes of them, some 300 bytes each, they stay in the second cache. Eight times as many take
+/// a tenth longer (docs/benchmarks/tried.md).
+const MOST: usize = 2048;
+
 /// Buffers and counts of one thread's loop.
 pub struct Loop {
     tracer: Tracer,
@@ -42,11 +46,11 @@ pub struct Loop {
 }
 
 impl Loop {
-    /// A loop that traces `batch` rays (at least 1) together.
+    /// A loop that traces `batch` rays together, or 1 or [`MOST`] if it is out of this range.
     pub fn new(kernel: Kernel, batch: usize) -> Result<Self, UnsupportedKernel> {
         Ok(Loop {
             tracer: Tracer::new(kernel)?,
-            batch: batch.max(1),
+            batch: batch.clamp(1, MOST),
             rays: RayCounts::default(),
             rays_in: Vec::new(),
             hits: Vec::new(),

@@ -272,6 +272,10 @@ impl Forest {
     pub(super) fn arena(&self) -> &[u8] {
         self.arena.bytes()
     }
+    /// Bytes of the arena that blocks and top trees take.
+    pub(super) fn arena_in_use(&self) -> u64 {
+        self.blocks.iter().map(|b| b.bytes).chain(self.tops.iter().map(|t| t.1)).sum()
+    }
     /// The triangles' root, always a node.
     pub(super) fn root(&self) -> u32 {
         node_ref(self.tree(0).root)

@@ -34,6 +34,22 @@ pub struct Lights {
     sky: Option<Vec3>,
     sky_probability: f32,
     only_triangles: bool,
+    /// The sources once more, if they are triangles and at most [`FEW`].
+    few: Vec<FewTriangles>,
+}
+
+/// So many sources are chosen from by comparing with each.
+const FEW: usize = 8;
+
+/// A triangle of those that are all the sources there are.
+#[derive(Clone, Debug)]
+pub(crate) struct FewTriangles {
+    /// Where its interval begins; the next one's begins where it ends.
+    pub start: u32,
+    pub light: TriangleLight,
+    pub radiance: Vec3,
+    /// With which it is chosen.
+    pub probability: f32,
 }
 
 /// One primitive, or the sky.
@@ -117,7 +133,8 @@ impl Lights {
         }
         let sky_probability = sky.map_or(0.0, |_| sources.last().map_or(0.0, |s| s.probability));
         let only_triangles = !sources.is_empty() && sources.iter().all(|s| matches!(s.geometry, Geometry::Triangle(_)));
-        Lights { sources, ends, by_prim, sky, sky_probability, only_triangles }
+        let few = if only_triangles && sources.len() <= FEW { few_triangles(&sources, &ends) } else { Vec::new() };
+        Lights { sources, ends, by_prim, sky, sky_probability, only_triangles, few }
     }
 
     /// Whether there is nothing to sample.
@@ -161,6 +178,12 @@ impl Lights {
         self.only_triangles
     }
 
+    /// All sources, the first beginning at 0, if they are triangles and few.
+    #[inline(always)]
+    pub(crate) fn few_triangles(&self) -> Option<&[FewTriangles]> {
+        (!self.few.is_empty()).then_some(&self.few)
+    }
+
     /// Density of [`Lights::sample`], from `o`, in the direction `d` that met the front of primitive `prim` at distance `t`, where the cosine
     /// between the source's normal and the way back is `cos`. 0 for what is never sampled.
     #[inline]
@@ -202,6 +225,21 @@ impl Geometry {
             Geometry::Sky => 0.0,
         }
     }
+}
+
+/// Sources that are triangles, with the beginnings of their intervals; without those that begin, and end, at 2^32.
+fn few_triangles(sources: &[Source], ends: &[u64]) -> Vec<FewTriangles> {
+    let starts = std::iter::once(0).chain(ends.iter().copied());
+    let few = sources.iter().zip(starts).filter_map(|(source, start)| match source.geometry {
+        Geometry::Triangle(light) => Some(FewTriangles {
+            start: u32::try_from(start).ok()?,
+            light,
+            radiance: source.emission,
+            probability: source.probability,
+        }),
+        _ => None,
+    });
+    few.collect()
 }
 
 /// The sky's share of the choice: all when it is alone, else by the power that enters the scene's bounding sphere, but at most

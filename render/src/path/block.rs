@@ -6,10 +6,10 @@
 
 use glam::Vec3;
 
-use super::diffuse::{Fate, onwards, towards_light};
+use super::diffuse::{Fate, cosine_direction, onwards, snap, towards_light};
 use super::interaction::Flat;
 use super::{Context, Outcome, PathRay, ShadowRay, wide};
-use crate::light::TriangleLight;
+use crate::light::{FewTriangles, TriangleLight};
 use crate::math::{UnitDir, offset_origin, unit};
 use crate::ray::{PathKey, Ray};
 use crate::sampler::{BSDF, LIGHT, LIGHT_CHOICE, ROULETTE, Streams};
@@ -38,27 +38,14 @@ impl Lanes3 {
     }
 }
 
-/// One vertex of a path, before scattering.
-#[derive(Clone, Copy, Debug)]
-pub(super) struct Vertex {
-    /// The ray's place in the batch.
-    pub index: u32,
-    /// Key of the ray, with the number of the sibling.
-    pub key: PathKey,
-    /// Throughput, a sibling's share.
-    pub throughput: Vec3,
-    /// The surface, when it is a flat diffuse triangle.
-    pub flat: Option<FlatDiffuse>,
-}
-
 /// A hit of a diffuse triangle without shading normals.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct FlatDiffuse {
     pub vertices: [[f32; 3]; 3],
     pub u: f32,
     pub v: f32,
-    pub d: Vec3,
-    pub reflectance: Vec3,
+    pub d: [f32; 3],
+    pub reflectance: [f32; 3],
     pub two_sided: bool,
 }
 
@@ -68,6 +55,7 @@ pub(super) struct Block {
     len: usize,
     index: [u32; N],
     key: [PathKey; N],
+    /// To be shaded the plain way.
     passes: [bool; N],
     two_sided: [bool; N],
     throughput: Lanes3,
@@ -81,8 +69,7 @@ pub(super) struct Block {
     // of the geometry
     normal: Lanes3,
     origin: Lanes3,
-    from_front: [bool; N],
-    sound: [bool; N],
+    seen: [bool; N],
     // numbers
     direction: [Lanes; 2],
     go_on: Lanes,
@@ -106,8 +93,11 @@ pub(super) struct Block {
     shadow_dir: [UnitDir; N],
     shadow_d: Lanes3,
     contribution: Lanes3,
+    /// Whether there is a shadow ray.
+    casts: [bool; N],
     next_dir: [UnitDir; N],
     next_d: Lanes3,
+    above: [bool; N],
     next_throughput: Lanes3,
     next_pdf: Lanes,
     fate: [Fate; N],
@@ -132,8 +122,7 @@ impl Default for Block {
             reflectance: Lanes3::ZERO,
             normal: Lanes3::ZERO,
             origin: Lanes3::ZERO,
-            from_front: [false; N],
-            sound: [false; N],
+            seen: [false; N],
             direction: [lanes; 2],
             go_on: lanes,
             place: [lanes; 2],
@@ -154,8 +143,10 @@ impl Default for Block {
             shadow_dir: [UnitDir::default(); N],
             shadow_d: Lanes3::ZERO,
             contribution: Lanes3::ZERO,
+            casts: [false; N],
             next_dir: [UnitDir::default(); N],
             next_d: Lanes3::ZERO,
+            above: [false; N],
             next_throughput: Lanes3::ZERO,
             next_pdf: lanes,
             fate: [Fate::Absorbed; N],
@@ -164,36 +155,50 @@ impl Default for Block {
 }
 
 impl Block {
-    /// Adds a vertex; true when the block is full and must be flushed.
+    /// Adds a vertex of the ray at `index` of the batch, with a sibling's key and throughput, and its surface if it is a flat diffuse triangle;
+    /// true when the block is full and must be flushed.
     #[inline(always)]
-    pub(super) fn push(&mut self, vertex: Vertex) -> bool {
-        let i = self.len;
-        self.index[i] = vertex.index;
-        self.key[i] = vertex.key;
-        self.throughput.set(i, vertex.throughput);
-        self.passes[i] = vertex.flat.is_none();
-        if let Some(flat) = &vertex.flat {
+    pub(super) fn push(&mut self, index: u32, key: PathKey, throughput: Vec3, flat: Option<&FlatDiffuse>) -> bool {
+        // the mask changes nothing, and tells the compiler that there is a place
+        let i = self.len & (N - 1);
+        self.index[i] = index;
+        self.key[i] = key;
+        self.throughput.set(i, throughput);
+        self.passes[i] = flat.is_none();
+        if let Some(flat) = flat {
             self.p0.set(i, flat.vertices[0].into());
             self.p1.set(i, flat.vertices[1].into());
             self.p2.set(i, flat.vertices[2].into());
             self.u[i] = flat.u;
             self.v[i] = flat.v;
-            self.d.set(i, flat.d);
-            self.reflectance.set(i, flat.reflectance);
+            self.d.set(i, flat.d.into());
+            self.reflectance.set(i, flat.reflectance.into());
             self.two_sided[i] = flat.two_sided;
         }
         self.len += 1;
         self.len == N
     }
 
-    /// Scatters all vertices and appends what comes of them to `out` in order; `plain` does those that pass through.
-    pub(super) fn flush(&mut self, context: &Context, out: &mut Outcome, plain: impl FnMut(Vertex, &mut Outcome)) {
+    /// Scatters all vertices and appends what comes of them to `out` in order; `plain` does those that pass through, by index, key and
+    /// throughput.
+    pub(super) fn flush(
+        &mut self,
+        context: &Context,
+        out: &mut Outcome,
+        plain: impl FnMut(usize, PathKey, Vec3, &mut Outcome),
+    ) {
         // a few vertices are done sooner one by one
         let few = self.len < 4;
-        if !few {
+        if few {
+            self.passes = [true; N];
+        } else {
             wide::compute(self, context);
         }
-        self.emit(few, out, plain);
+        if self.passes[..self.len].contains(&true) {
+            self.emit_mixed(out, plain);
+        } else {
+            self.emit(out);
+        }
         self.len = 0;
     }
 
@@ -215,8 +220,8 @@ impl Block {
             let flat = Flat::new(self.p0.get(i), self.p1.get(i), self.p2.get(i), self.u[i], self.v[i], self.d.get(i));
             self.normal.set(i, flat.normal);
             self.origin.set(i, offset_origin(&flat.position, flat.normal));
-            self.from_front[i] = flat.from_front;
-            self.sound[i] = flat.sound;
+            self.seen[i] = flat.from_front | self.two_sided[i];
+            self.passes[i] |= !flat.sound;
         }
     }
 
@@ -224,23 +229,33 @@ impl Block {
     fn numbers(&mut self, context: &Context) {
         let frame = context.frame;
         let mut streams = Streams::new(frame.seed);
+        const DIMENSIONS: [usize; 5] = [BSDF, BSDF + 1, LIGHT, LIGHT + 1, ROULETTE];
+        let mut raw = [[0; N]; 5];
         for i in 0..self.len {
             let key = self.key[i];
             let vertex = u32::from(key.vertex) + 1;
             let stream = streams.get(key.pixel, key.sample);
             let numbers = stream.vertex(vertex, frame.split, u32::from(key.branch));
-            self.direction[0][i] = unit(numbers[BSDF]);
-            self.direction[1][i] = unit(numbers[BSDF + 1]);
-            self.place[0][i] = unit(numbers[LIGHT]);
-            self.place[1][i] = unit(numbers[LIGHT + 1]);
+            for (lanes, k) in raw.iter_mut().zip(DIMENSIONS) {
+                lanes[i] = numbers[k];
+            }
             self.choice[i] = numbers[LIGHT_CHOICE];
-            self.go_on[i] = unit(numbers[ROULETTE]);
             self.roulette[i] = vertex >= frame.rr_depth;
+        }
+        let [d0, d1] = &mut self.direction;
+        let [p0, p1] = &mut self.place;
+        for (lanes, raw) in [d0, d1, p0, p1, &mut self.go_on].into_iter().zip(&raw) {
+            for i in 0..N {
+                lanes[i] = unit(raw[i]);
+            }
         }
     }
 
     #[inline(always)]
     fn choose_lights(&mut self, context: &Context) {
+        if let Some(few) = context.lights.few_triangles() {
+            return self.choose_of_few(few);
+        }
         for i in 0..self.len {
             let Some((Some(triangle), radiance, probability)) = context.lights.chosen(self.choice[i]) else {
                 continue;
@@ -253,6 +268,37 @@ impl Block {
             self.light_error[i] = triangle.error;
             self.radiance.set(i, radiance);
             self.probability[i] = probability;
+        }
+    }
+
+    /// By comparing each number with each source: the last whose interval begins at or before it.
+    #[inline(always)]
+    fn choose_of_few(&mut self, few: &[FewTriangles]) {
+        for FewTriangles { start, light, radiance, probability } in few {
+            // bits all 1 where it is chosen: a select of floats would be unrolled into branches
+            let mut mask = [0; N];
+            for i in 0..N {
+                mask[i] = if self.choice[i] >= *start { u32::MAX } else { 0 };
+            }
+            let set = |lanes: &mut Lanes, x: f32| {
+                for i in 0..N {
+                    lanes[i] = f32::from_bits((x.to_bits() & mask[i]) | (lanes[i].to_bits() & !mask[i]));
+                }
+            };
+            for (lanes, v) in [
+                (&mut self.light_p0, light.p0),
+                (&mut self.light_e1, light.e1),
+                (&mut self.light_e2, light.e2),
+                (&mut self.light_normal, light.normal),
+                (&mut self.radiance, *radiance),
+            ] {
+                set(&mut lanes.0[0], v.x);
+                set(&mut lanes.0[1], v.y);
+                set(&mut lanes.0[2], v.z);
+            }
+            set(&mut self.light_area, light.area);
+            set(&mut self.light_error, light.error);
+            set(&mut self.probability, *probability);
         }
     }
 
@@ -297,78 +343,132 @@ impl Block {
         }
     }
 
+    // one loop for what is done in f64, one for the rest: a loop's vectors are as wide as its widest type allows
+
     #[inline(always)]
     fn shadow_rays(&mut self) {
         for i in 0..N {
-            let (dir, d, contribution) = towards_light(
+            let (dir, d) = snap(self.light_d.get(i));
+            self.shadow_dir[i] = dir;
+            self.shadow_d.set(i, d);
+        }
+        for i in 0..N {
+            let contribution = towards_light(
                 self.throughput.get(i),
                 self.reflectance.get(i),
                 self.normal.get(i),
                 self.light_d.get(i),
+                self.shadow_d.get(i),
                 self.light_pdf[i],
                 self.radiance.get(i),
-                self.lit[i],
+                self.lit[i] & self.seen[i],
             );
-            self.shadow_dir[i] = dir;
-            self.shadow_d.set(i, d);
             self.contribution.set(i, contribution);
+            self.casts[i] = (contribution.x != 0.0) | (contribution.y != 0.0) | (contribution.z != 0.0);
         }
     }
 
     #[inline(always)]
     fn next_rays(&mut self, siblings: f32) {
         for i in 0..N {
-            let (dir, d, throughput, pdf, fate) = onwards(
+            let (d, above) = cosine_direction(self.normal.get(i), [self.direction[0][i], self.direction[1][i]]);
+            self.next_d.set(i, d);
+            self.above[i] = above & self.seen[i];
+        }
+        for i in 0..N {
+            let (dir, d) = snap(self.next_d.get(i));
+            self.next_dir[i] = dir;
+            self.next_d.set(i, d);
+        }
+        for i in 0..N {
+            let (throughput, pdf, fate) = onwards(
                 self.throughput.get(i),
                 self.reflectance.get(i),
                 self.normal.get(i),
-                [self.direction[0][i], self.direction[1][i]],
+                self.next_d.get(i),
+                self.above[i],
                 self.go_on[i],
                 self.roulette[i],
                 siblings,
             );
-            self.next_dir[i] = dir;
-            self.next_d.set(i, d);
             self.next_throughput.set(i, throughput);
             self.next_pdf[i] = pdf;
             self.fate[i] = fate;
         }
     }
 
-    #[inline(always)]
-    fn emit(&mut self, few: bool, out: &mut Outcome, mut plain: impl FnMut(Vertex, &mut Outcome)) {
+    /// Appends what came of vertices none of which passes: without branches that depend on them.
+    fn emit(&mut self, out: &mut Outcome) {
+        let (mut shadows, mut nexts) = ([0u8; N], [0u8; N]);
+        let (mut shadow, mut next, mut roulette) = (0, 0, 0);
         for i in 0..self.len {
-            let key = self.key[i];
-            if few || self.passes[i] || !self.sound[i] {
-                let throughput = self.throughput.get(i);
-                plain(Vertex { index: self.index[i], key, throughput, flat: None }, out);
+            // written before it is known whether it counts
+            shadows[shadow & (N - 1)] = i as u8;
+            shadow += usize::from(self.casts[i]);
+            nexts[next & (N - 1)] = i as u8;
+            next += usize::from(self.fate[i] == Fate::On);
+            roulette += u64::from(self.fate[i] == Fate::Roulette);
+        }
+        out.counters.roulette += roulette;
+        out.counters.absorbed += (self.len - next) as u64 - roulette;
+        let place = |i: &u8| usize::from(*i) & (N - 1);
+        let (shadows, nexts) = (&shadows[..shadow], &nexts[..next]);
+        out.shadow.extend(shadows.iter().map(|i| self.shadow(place(i))));
+        out.shadow_rays.extend(shadows.iter().map(|i| self.shadow_ray(place(i))));
+        out.next.extend(nexts.iter().map(|i| self.next(place(i))));
+        out.next_rays.extend(nexts.iter().map(|i| self.next_ray(place(i))));
+    }
+
+    /// The same in the order of the vertices, where some pass.
+    fn emit_mixed(&mut self, out: &mut Outcome, mut plain: impl FnMut(usize, PathKey, Vec3, &mut Outcome)) {
+        for i in 0..self.len {
+            if self.passes[i] {
+                plain(self.index[i] as usize, self.key[i], self.throughput.get(i), out);
                 continue;
             }
-            if !(self.from_front[i] || self.two_sided[i]) {
-                out.counters.absorbed += 1;
-                continue;
-            }
-            let o = self.origin.get(i).to_array();
-            let contribution = self.contribution.get(i);
-            if contribution != Vec3::ZERO {
-                let (dir, tmax) = (self.shadow_dir[i], self.light_tmax[i]);
-                out.shadow.push(ShadowRay { o, dir, tmax, contribution: contribution.to_array(), key });
-                out.shadow_rays.push(Ray { o, tmin: 0.0, d: self.shadow_d.get(i).to_array(), tmax });
+            if self.casts[i] {
+                out.shadow.push(self.shadow(i));
+                out.shadow_rays.push(self.shadow_ray(i));
             }
             match self.fate[i] {
                 Fate::On => {
-                    out.next.push(PathRay {
-                        o,
-                        dir: self.next_dir[i],
-                        key: PathKey { vertex: key.vertex + 1, ..key },
-                        throughput: self.next_throughput.get(i).to_array(),
-                        pdf: self.next_pdf[i],
-                    });
-                    out.next_rays.push(Ray { o, tmin: 0.0, d: self.next_d.get(i).to_array(), tmax: f32::INFINITY });
+                    out.next.push(self.next(i));
+                    out.next_rays.push(self.next_ray(i));
                 }
                 Fate::Absorbed => out.counters.absorbed += 1,
                 Fate::Roulette => out.counters.roulette += 1,
             }
         }
+    }
+
+    #[inline(always)]
+    fn shadow(&self, i: usize) -> ShadowRay {
+        ShadowRay {
+            o: self.origin.get(i).to_array(),
+            dir: self.shadow_dir[i],
+            tmax: self.light_tmax[i],
+            contribution: self.contribution.get(i).to_array(),
+            key: self.key[i],
+        }
+    }
+    #[inline(always)]
+    fn shadow_ray(&self, i: usize) -> Ray {
+        let (o, d) = (self.origin.get(i).to_array(), self.shadow_d.get(i).to_array());
+        Ray { o, tmin: 0.0, d, tmax: self.light_tmax[i] }
+    }
+    #[inline(always)]
+    fn next(&self, i: usize) -> PathRay {
+        PathRay {
+            o: self.origin.get(i).to_array(),
+            dir: self.next_dir[i],
+            key: PathKey { vertex: self.key[i].vertex + 1, ..self.key[i] },
+            throughput: self.next_throughput.get(i).to_array(),
+            pdf: self.next_pdf[i],
+        }
+    }
+    #[inline(always)]
+    fn next_ray(&self, i: usize) -> Ray {
+        let (o, d) = (self.origin.get(i).to_array(), self.next_d.get(i).to_array());
+        Ray { o, tmin: 0.0, d, tmax: f32::INFINITY }
     }
 }

@@ -110,6 +110,18 @@ pub struct Surface {
 pub trait Surfaces {
     /// The surface of the hit (never a miss) of ray `index` of the batch.
     fn surface(&self, index: usize, hit: &Hit) -> Surface;
+    /// Its shape's number: `surface().shape`.
+    fn shape(&self, index: usize, hit: &Hit) -> u32 {
+        self.surface(index, hit).shape
+    }
+    /// The vertices of a triangle without shading normals, `None` for everything else: what [`Surfaces::surface`] says, for callers that
+    /// need no more.
+    fn flat_triangle(&self, index: usize, hit: &Hit) -> Option<[[f32; 3]; 3]> {
+        match self.surface(index, hit) {
+            Surface { geometry: Primitive::Triangle(vertices), normals: None, .. } => Some(vertices),
+            _ => None,
+        }
+    }
     /// The global id of what ray `index` hit: asked for where light is met only.
     fn prim(&self, index: usize, hit: &Hit) -> PrimId;
 }

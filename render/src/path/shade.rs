@@ -2,15 +2,14 @@
 
 use glam::Vec3;
 
-use super::block::{Block, FlatDiffuse, Vertex};
-use super::diffuse::{Fate, onwards, towards_light};
+use super::block::{Block, FlatDiffuse};
+use super::diffuse::{Fate, cosine_direction, onwards, snap, towards_light};
 use super::interaction::Interaction;
 use super::{Context, Contribution, Outcome, PathRay, ShadowRay, Surface, Surfaces, power_heuristic};
-use crate::material::Bsdf;
+use crate::material::{Bsdf, Material};
 use crate::math::{UnitDir, unit};
-use crate::ray::{Hit, PathKey, PrimId, Ray};
+use crate::ray::{Hit, PathKey, Ray};
 use crate::sampler::{BSDF, LIGHT, LIGHT_CHOICE, LOBE, ROULETTE, Stream};
-use crate::world::Primitive;
 
 /// Shades each ray with its hit and appends what comes of it to `out`.
 ///
@@ -38,20 +37,35 @@ pub fn shade_traced<S: Surfaces>(
 ) {
     let mut block = out.block.take().unwrap_or_default();
     out.counters.shaded += rays.len() as u64;
+    let (sky, sky_pdf) = (context.lights.sky(), context.lights.sky_pdf());
     for (index, ((ray, traced), hit)) in rays.iter().zip(traced).zip(hits).enumerate() {
         if !hit.is_hit() {
             out.counters.missed += 1;
-            emit(ray, context.lights.sky(), context.lights.sky_pdf(), out);
+            if sky != Vec3::ZERO {
+                emit(ray, sky, sky_pdf, out);
+            }
             continue;
         }
-        let surface = surfaces.surface(index, hit);
-        let prim = || surfaces.prim(index, hit);
-        arrive(context, ray, traced.d.into(), hit, &surface, prim, out, |vertex, out| {
-            let full = block.push(Vertex { index: index as u32, ..vertex });
-            if full {
+        let Some(Leaving { material, children, throughput }) = arrive(context, surfaces, index, ray, hit, out) else {
+            continue;
+        };
+        let flat = match &material.bsdf {
+            Bsdf::Diffuse { reflectance } => surfaces.flat_triangle(index, hit).map(|vertices| FlatDiffuse {
+                vertices,
+                u: hit.u,
+                v: hit.v,
+                d: traced.d,
+                reflectance: *reflectance,
+                two_sided: material.two_sided,
+            }),
+            _ => None,
+        };
+        for child in 0..children {
+            let key = PathKey { branch: ray.key.branch + child as u16, ..ray.key };
+            if block.push(index as u32, key, throughput, flat.as_ref()) {
                 flush(context, surfaces, rays, hits, &mut block, out);
             }
-        });
+        }
     }
     flush(context, surfaces, rays, hits, &mut block, out);
     out.block = Some(block);
@@ -73,11 +87,11 @@ pub(super) fn shade_plain<S: Surfaces>(
             emit(ray, context.lights.sky(), context.lights.sky_pdf(), out);
             continue;
         }
-        let surface = surfaces.surface(index, hit);
-        let prim = || surfaces.prim(index, hit);
-        arrive(context, ray, ray.dir.decode().into(), hit, &surface, prim, out, |vertex, out| {
-            scatter_plain(context, ray, vertex.key, vertex.throughput, hit, &surface, out);
-        });
+        let Some(leaving) = arrive(context, surfaces, index, ray, hit, out) else { continue };
+        for child in 0..leaving.children {
+            let key = PathKey { branch: ray.key.branch + child as u16, ..ray.key };
+            scatter_plain(context, ray, key, leaving.throughput, hit, &surfaces.surface(index, hit), out);
+        }
     }
 }
 
@@ -89,10 +103,9 @@ fn flush<S: Surfaces>(
     block: &mut Block,
     out: &mut Outcome,
 ) {
-    block.flush(context, out, |vertex, out| {
-        let (ray, hit) = (&rays[vertex.index as usize], &hits[vertex.index as usize]);
-        let surface = surfaces.surface(vertex.index as usize, hit);
-        scatter_plain(context, ray, vertex.key, vertex.throughput, hit, &surface, out);
+    block.flush(context, out, |index, key, throughput, out| {
+        let (ray, hit) = (&rays[index], &hits[index]);
+        scatter_plain(context, ray, key, throughput, hit, &surfaces.surface(index, hit), out);
     });
 }
 
@@ -105,68 +118,61 @@ fn emit(ray: &PathRay, radiance: Vec3, light_pdf: f32, out: &mut Outcome) {
     }
 }
 
-/// Emission, depth and splitting; then `each` for every path that leaves from here.
+/// What leaves from a hit.
+struct Leaving<'a> {
+    material: &'a Material,
+    /// How many paths.
+    children: u32,
+    /// Of each.
+    throughput: Vec3,
+}
+
+/// Emission, depth and splitting; `None` when the path ends here.
 #[inline(always)]
-fn arrive(
-    context: &Context,
+fn arrive<'a, S: Surfaces>(
+    context: &Context<'a>,
+    surfaces: &S,
+    index: usize,
     ray: &PathRay,
-    d: Vec3,
     hit: &Hit,
-    surface: &Surface,
-    prim: impl Fn() -> PrimId,
     out: &mut Outcome,
-    mut each: impl FnMut(Vertex, &mut Outcome),
-) {
-    let frame = context.frame;
-    let shape = &context.world.shapes[surface.shape as usize];
+) -> Option<Leaving<'a>> {
+    let (frame, world) = (context.frame, context.world);
+    let shape = &world.shapes[surfaces.shape(index, hit) as usize];
     if let Some(emission) = shape.emission {
-        emit_surface(context, ray, d, hit, surface, prim(), emission.into(), out);
+        emit_surface(context, surfaces, index, ray, hit, emission.into(), out);
     }
     let number = u32::from(ray.key.vertex) + 1;
     if number >= frame.max_depth {
         out.counters.depth += 1;
-        return;
+        return None;
     }
-    let material = &context.world.materials[shape.material as usize];
-    let flat = match (surface.geometry, &surface.normals, &material.bsdf) {
-        (Primitive::Triangle(vertices), None, Bsdf::Diffuse { reflectance }) => Some(FlatDiffuse {
-            vertices,
-            u: hit.u,
-            v: hit.v,
-            d,
-            reflectance: Vec3::from(*reflectance),
-            two_sided: material.two_sided,
-        }),
-        _ => None,
-    };
+    let material = &world.materials[shape.material as usize];
     let throughput = Vec3::from(ray.throughput);
     // a mirror would send every sibling the same way
     if number == 1 && frame.split > 1 && !material.bsdf.is_mirror() {
         let share = throughput / frame.split as f32;
-        for child in 0..frame.split {
-            let key = PathKey { branch: child as u16, ..ray.key };
-            each(Vertex { index: 0, key, throughput: share, flat }, out);
-        }
-    } else {
-        each(Vertex { index: 0, key: ray.key, throughput, flat }, out);
+        return Some(Leaving { material, children: frame.split, throughput: share });
     }
+    Some(Leaving { material, children: 1, throughput })
 }
 
-fn emit_surface(
+#[inline(never)]
+fn emit_surface<S: Surfaces>(
     context: &Context,
+    surfaces: &S,
+    index: usize,
     ray: &PathRay,
-    d: Vec3,
     hit: &Hit,
-    surface: &Surface,
-    prim: PrimId,
     emission: Vec3,
     out: &mut Outcome,
 ) {
-    let o = Vec3::from(ray.o);
-    if let Some(at) = Interaction::new(o, d, hit, surface)
+    let (o, d) = (Vec3::from(ray.o), Vec3::from(ray.dir.decode()));
+    if let Some(at) = Interaction::new(o, d, hit, &surfaces.surface(index, hit))
         && at.from_front
     {
-        let pdf = if ray.pdf > 0.0 { context.lights.pdf(prim, o, hit.t, -at.normal.dot(d)) } else { 0.0 };
+        let density = || context.lights.pdf(surfaces.prim(index, hit), o, hit.t, -at.normal.dot(d));
+        let pdf = if ray.pdf > 0.0 { density() } else { 0.0 };
         emit(ray, emission, pdf, out);
     }
 }
@@ -218,12 +224,14 @@ pub(super) fn scatter_plain(
     {
         let reflectance = Vec3::from(*reflectance);
         if let Some(light) = light {
-            let (dir, _, contribution) =
-                towards_light(throughput, reflectance, at.normal, light.d, light.pdf, light.radiance, true);
+            let (dir, wi) = snap(light.d);
+            let contribution =
+                towards_light(throughput, reflectance, at.normal, light.d, wi, light.pdf, light.radiance, true);
             shadow(origin, dir, light.tmax, contribution, out);
         }
-        let (dir, _, throughput, pdf, fate) =
-            onwards(throughput, reflectance, at.normal, direction, go_on, roulette, siblings);
+        let (d, above) = cosine_direction(at.normal, direction);
+        let (dir, wi) = snap(d);
+        let (throughput, pdf, fate) = onwards(throughput, reflectance, at.normal, wi, above, go_on, roulette, siblings);
         (origin, dir, throughput, pdf, fate)
     } else {
         let bsdf = &material.bsdf;

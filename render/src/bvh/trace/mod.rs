@@ -3,6 +3,8 @@
 mod scalar;
 mod setup;
 mod sphere;
+#[cfg(target_arch = "x86_64")]
+mod start;
 mod triangle;
 #[cfg(target_arch = "x86_64")]
 mod vector;

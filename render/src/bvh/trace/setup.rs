@@ -53,11 +53,11 @@ use super::super::layout::MAX_COORDINATE;
 use crate::ray::{MISS, Ray};
 
 /// Smallest and largest magnitude of a direction's largest component: 2^-30 and 2^30.
-const DIRECTION_RANGE: (f32, f32) = (1.0 / (1 << 30) as f32, (1 << 30) as f32);
+pub(super) const DIRECTION_RANGE: (f32, f32) = (1.0 / (1 << 30) as f32, (1 << 30) as f32);
 /// Components below this part of the largest count as 0: 2^-50.
-const NO_DIRECTION: f32 = 1.0 / (1u64 << 50) as f32;
+pub(super) const NO_DIRECTION: f32 = 1.0 / (1u64 << 50) as f32;
 /// Padding of the box test: 64 u.
-const PAD: f32 = 1.0 / (1 << 18) as f32;
+pub(super) const PAD: f32 = 1.0 / (1 << 18) as f32;
 
 /// State of one ray in flight. The first cache line serves the boxes, the second the triangles.
 #[repr(C, align(64))]
@@ -128,8 +128,7 @@ impl State {
         state
     }
 
-    /// Sets all but `top`, `current` and `ray` to the start of a ray; in place, since batches do it often.
-    #[inline(always)]
+    /// Sets all but `top`, `current` and `ray` to the start of a ray.
     pub fn start(&mut self, ray: &Ray, largest: f32) {
         let o = Vec4::new(ray.o[0], ray.o[1], ray.o[2], 0.0);
         let d = Vec4::new(ray.d[0], ray.d[1], ray.d[2], 0.0);

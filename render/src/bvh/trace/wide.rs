@@ -19,6 +19,7 @@ use std::arch::x86_64::*;
 use super::super::forest::Forest;
 use super::super::layout::*;
 use super::setup::State;
+use super::start::start;
 use super::triangle::{SMALL_AREA, barycentrics_of_small};
 use super::vector::{Avx2, Avx512, InstructionSet, sort4, sort8};
 use super::{Counters, Kernel, accept, runs};
@@ -30,6 +31,9 @@ const IN_FLIGHT: usize = 32;
 const DONE: u32 = u32::MAX;
 /// Entries below the bottom of each stack, so that eight can be read at once. Their keys are above every distance.
 const BASE: usize = 7;
+
+/// Trees of so many bytes stay in the first cache: what comes next need not be fetched ahead.
+const NEAR_BYTES: u64 = 16 << 10;
 
 /// Buffers of the rays in flight.
 #[derive(Default)]
@@ -160,11 +164,10 @@ unsafe fn rounds<I: InstructionSet, const ANY: bool, D: FnMut(usize, &mut State)
     let mut flying = 0;
 
     let start = |i: usize, state: &mut State| {
-        state.start(&rays[i], largest);
-        state.top = BASE as u32;
-        state.current = root;
-        state.ray = i as u32;
+        // SAFETY: the caller has the features.
+        unsafe { start(state, &rays[i], largest, root, i as u32, BASE as u32) };
     };
+    let is_far = forest.arena_in_use() > NEAR_BYTES;
 
     // SAFETY, for all that follows: lists have at most `flying` <= IN_FLIGHT entries, plus one that is written and not
     // counted; their entries are below IN_FLIGHT. A stack holds at most forest.stack() entries above its bottom at
@@ -257,12 +260,14 @@ unsafe fn rounds<I: InstructionSet, const ANY: bool, D: FnMut(usize, &mut State)
                 let current = *references.add(lane * stride + top);
                 state.top = (top as u32).wrapping_sub(1);
                 state.current = current;
-                // wrapping: DONE leads nowhere, and a prefetch may
-                let record = arena.wrapping_add(offset(current)).cast::<i8>();
-                _mm_prefetch::<_MM_HINT_T0>(record);
-                _mm_prefetch::<_MM_HINT_T0>(record.wrapping_add(64));
-                _mm_prefetch::<_MM_HINT_T0>(record.wrapping_add(128));
-                _mm_prefetch::<_MM_HINT_T0>(record.wrapping_add(192));
+                if is_far {
+                    // wrapping: DONE leads nowhere, and a prefetch may
+                    let record = arena.wrapping_add(offset(current)).cast::<i8>();
+                    _mm_prefetch::<_MM_HINT_T0>(record);
+                    _mm_prefetch::<_MM_HINT_T0>(record.wrapping_add(64));
+                    _mm_prefetch::<_MM_HINT_T0>(record.wrapping_add(128));
+                    _mm_prefetch::<_MM_HINT_T0>(record.wrapping_add(192));
+                }
                 *inner.add(inners) = lane as u8;
                 *leaf.add(leaves) = lane as u8;
                 *finished.add(finishes) = lane as u8;
