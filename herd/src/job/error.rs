@@ -8,7 +8,7 @@ use rayherd_scene::manifest::ManifestError;
 use rayherd_scene::objects::ObjectError;
 
 use crate::ledger::{ChainError, Refused};
-use crate::store::StoreError;
+use crate::store::{StoreError, object_is_users};
 use crate::wire::WireError;
 
 /// Why a job could not be run. [`JobError::is_users`] tells the user's mistakes from failures.
@@ -78,6 +78,9 @@ pub enum JobError {
         /// What was wrong with the last copy.
         why: String,
     },
+    /// Whoever watches the job ended it ([`super::Progress::is_cancelled`]).
+    #[error("stopped from outside")]
+    Cancelled,
     /// The attempt was ended from outside.
     #[error("the attempt was stopped")]
     Stopped,
@@ -99,8 +102,29 @@ pub enum JobError {
 }
 
 impl JobError {
-    /// Whether other settings, another scene or another store would help: exit code 2 rather than 1.
+    /// Whether other settings, another scene or another store would help: exit code 2. Otherwise it is ours, the machine's
+    /// or the network's: exit code 1.
     pub fn is_users(&self) -> bool {
-        !matches!(self, JobError::Internal(_) | JobError::Ledger(_))
+        match self {
+            JobError::Settings(_)
+            | JobError::Memory { .. }
+            | JobError::Frame(_)
+            | JobError::Kernel(_)
+            | JobError::Scene(_)
+            | JobError::Forest { .. }
+            | JobError::Attributes { .. }
+            | JobError::Chain(_)
+            | JobError::Owned(_) => true,
+            JobError::Manifest(ManifestError::Store(e)) | JobError::Object(e) => object_is_users(e),
+            JobError::Manifest(ManifestError::Malformed(_) | ManifestError::Format { .. }) => true,
+            JobError::Store(e) => e.is_users(),
+            JobError::Wire { .. }
+            | JobError::Lost { .. }
+            | JobError::Cancelled
+            | JobError::Stopped
+            | JobError::Film(_)
+            | JobError::Ledger(_)
+            | JobError::Internal(_) => false,
+        }
     }
 }

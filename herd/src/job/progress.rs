@@ -42,6 +42,10 @@ pub trait Progress: Send + Sync {
     fn wants_preview(&self) -> bool {
         false
     }
+    /// Whether the job is to end now, with what is committed kept; asked some times a second.
+    fn is_cancelled(&self) -> bool {
+        false
+    }
     /// The image so far.
     fn preview(&self, _image: &Image) {}
 }

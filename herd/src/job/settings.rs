@@ -7,6 +7,7 @@ use std::sync::Arc;
 use rayherd_api::Strategy;
 use rayherd_render::bvh::Kernel;
 
+use crate::local::faults::Faults;
 use crate::store::BlockStore;
 
 /// One node.
@@ -57,12 +58,13 @@ pub struct JobSettings {
     pub batch: u32,
     /// Bytes of rays that a task holds before it puts some of them into a group.
     pub ray_buffer: u64,
-    /// A task that runs longer than this, and three times its size, gets a second attempt when slots are idle.
-    pub straggler_seconds: f64,
+    /// A task that runs longer than this gets a second attempt when slots are idle; three times the size of a task, at least
+    /// a second, if none.
+    pub straggler_seconds: Option<f64>,
     /// Where commits are kept; nowhere if none.
     pub commits: Option<Commits>,
-    /// Seed of a schedule of faults to inject, for tests.
-    pub faults: Option<u64>,
+    /// Faults to inject, for tests.
+    pub faults: Option<Faults>,
 }
 
 impl Default for JobSettings {
@@ -80,7 +82,7 @@ impl Default for JobSettings {
             kernel: Kernel::Auto,
             batch: 16_384,
             ray_buffer: 64 << 20,
-            straggler_seconds: 1.0,
+            straggler_seconds: None,
             commits: None,
             faults: None,
         }

@@ -1,8 +1,14 @@
 //! The loop over rounds: plan, run attempts on threads, commit, until every ray has come to its end.
 
+mod attempts;
+mod commit;
+mod ending;
+mod losses;
+mod planning;
+mod steps;
+
 use std::collections::{BTreeMap, BTreeSet};
 use std::ops::Range;
-use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
 use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender, channel};
 use std::thread::Scope;
@@ -11,28 +17,31 @@ use std::time::{Duration, Instant};
 use rayherd_render::film::FilmPart;
 use rayherd_render::frame::Frame;
 
-use super::attempt::{Attempt, Made, Shared, run};
+use super::attempt::{Attempt, Made, Shared};
 use super::cameras::Cameras;
-use super::faults::{Fate, Faults};
+use super::faults::Faults;
 use super::journal;
 use super::nodes::Nodes;
 use super::owner::Ownership;
 use super::slots::{Gate, StopFlag};
-use super::{JobOutcome, check, usage};
-use crate::job::{Image, JobError, JobSettings, NodeSpec, PreparedScene, Progress, Sampling, Status};
-use crate::ledger::{Destination, GroupRef, Inputs, Ledger, Outputs, Record, Refused, Snapshot, TaskId};
+use super::{JobOutcome, check};
+use crate::job::{Image, JobError, JobSettings, PreparedScene, Progress, Sampling};
+use crate::ledger::{Ledger, Snapshot, TaskId};
 use crate::plan::cost::Traffic;
 use crate::plan::rate::Rate;
-use crate::plan::{self, Assignment, NodeView, Set, SplitView, View, Waiting};
-use crate::report::{Kind, Report};
-use crate::store::MemoryStore;
+use crate::store::Spilling;
 use crate::task::camera::tiles;
-use crate::wave;
 
-/// Largest forest that a task may hold (see `rayherd_render::bvh::Forest`), less room for its top tree.
-const FOREST_BYTES: u64 = (8 << 30) - (64 << 20);
+/// Ray groups and film parts of a job without a store that stay in memory; what is more goes to a temporary folder.
+const AT_REST_IN_MEMORY: u64 = 128 << 20;
 
-pub(super) fn render(
+/// Renders a frame of a prepared scene on virtual nodes in this process.
+///
+/// The image is a function of (scene, frame, samples) alone, to the byte: not of the settings, not of time.
+///
+/// # Errors
+/// When settings, scene or store do not allow it; see [`JobError`].
+pub fn render_local(
     scene: &PreparedScene,
     frame: &Frame,
     sampling: &Sampling,
@@ -40,7 +49,10 @@ pub(super) fn render(
     progress: &dyn Progress,
 ) -> Result<JobOutcome, JobError> {
     check(scene, frame, sampling, settings)?;
-    let store = settings.commits.as_ref().map_or_else(|| Arc::new(MemoryStore::default()) as _, |c| c.store.clone());
+    let store = match &settings.commits {
+        Some(commits) => commits.store.clone(),
+        None => Arc::new(Spilling::new(AT_REST_IN_MEMORY)) as _,
+    };
     let nodes = Nodes::new(scene, settings, store)?;
     let durable = settings.commits.is_some();
     let shared = Shared {
@@ -64,6 +76,7 @@ pub(super) fn render(
         driver.stop_all();
         result
     });
+    driver.discard_late(&receive)?;
     match result {
         Ok(()) => driver.finish(),
         Err(e) => {
@@ -157,12 +170,6 @@ struct Live {
 /// Objects by name, with the nodes that hold them.
 type Objects = Vec<(String, Vec<u32>)>;
 
-/// Camera units that are queued at once, about; steps are added as they are used up.
-const QUEUED_UNITS: usize = 100_000;
-
-/// Commits between two snapshots.
-const SNAPSHOT_EVERY: u64 = 16;
-
 struct Driver<'s, 'a> {
     shared: &'s Shared<'a>,
     gate: &'s Gate,
@@ -232,7 +239,7 @@ impl<'s, 'a> Driver<'s, 'a> {
             owner: begin.owner,
             reused: begin.reused,
             redone: begin.redone,
-            faults: shared.settings.faults.map(Faults::new),
+            faults: shared.settings.faults,
             cameras: Cameras::new(shared.frame, starts),
             sampling,
             progress,
@@ -270,6 +277,9 @@ impl<'s, 'a> Driver<'s, 'a> {
             if self.queued > 0 && self.is_step_over() && self.step_done() {
                 return Ok(());
             }
+            if self.progress.is_cancelled() {
+                return Err(JobError::Cancelled);
+            }
             self.queue_steps();
             let mut started = false;
             if !barrier || self.running.is_empty() {
@@ -300,488 +310,8 @@ impl<'s, 'a> Driver<'s, 'a> {
         }
     }
 
-    /// Queues camera units of the next steps, as far as they need not wait for what comes before.
-    fn queue_steps(&mut self) {
-        let spp = self.sampling.spp;
-        while self.queued < spp {
-            let first = !self.begun;
-            let wait = self.sampling.target_error.is_some() && !(self.ledger.is_quiet() && self.running.is_empty());
-            let late =
-                self.sampling.time_limit.is_some_and(|limit| !first && self.start.elapsed().as_secs_f64() >= limit);
-            let enough = (self.sampling.target_error.is_some() || self.sampling.time_limit.is_some())
-                && (!self.cameras.is_empty() || (!first && self.queued > self.ledger.taken().complete()));
-            if !first && (wait || late || enough || self.cameras.units() > QUEUED_UNITS) {
-                return;
-            }
-            let end = self.step_end();
-            self.cameras.add(self.queued..end, self.ledger.taken());
-            self.queued = end;
-            self.begun = true;
-            if self.sampling.target_error.is_some() || self.sampling.time_limit.is_some() {
-                return;
-            }
-        }
-    }
-
-    /// Where the step that begins at `self.queued` ends: where the schedule says, or before, if time would run out.
-    fn step_end(&self) -> u32 {
-        // what an earlier run began of a step is finished first
-        let reach = self.ledger.taken().reach();
-        let end = wave::step_end(self.queued).min(self.sampling.spp).max(reach);
-        let Some(limit) = self.sampling.time_limit else { return end };
-        let elapsed = self.start.elapsed().as_secs_f64();
-        if !self.begun || elapsed <= 0.0 {
-            return end;
-        }
-        let [w, h] = self.shared.frame.size;
-        let made = self.ledger.rays().camera as f64 / (f64::from(w) * f64::from(h));
-        let samples_left = made / elapsed * (limit - elapsed).max(0.0);
-        end.min(self.queued + (samples_left as u32).max(1)).max(reach)
-    }
-
-    /// Whether everything queued came to its end.
-    fn is_step_over(&self) -> bool {
-        self.ledger.is_quiet() && self.cameras.is_empty() && self.ledger.done().reach() == self.queued
-    }
-
-    /// After everything queued came to its end: whether the job is over.
-    fn step_done(&mut self) -> bool {
-        self.error = self.film.rel_mse(self.queued);
-        let reached = match (self.sampling.target_error, self.error) {
-            (Some(target), Some(error)) => error <= target,
-            _ => false,
-        };
-        let late = self.sampling.time_limit.is_some_and(|limit| self.start.elapsed().as_secs_f64() >= limit);
-        self.queued >= self.sampling.spp || reached || late
-    }
-
-    /// What to start now, with the keys of the groups that each takes.
-    fn plan(&mut self) -> Vec<(Assignment, Vec<String>)> {
-        let settings = self.shared.settings;
-        let holders = self.shared.nodes.holders();
-        let split =
-            |&s: &u32| SplitView { bytes: self.shared.scene.split_bytes(s), holders: holders[s as usize].clone() };
-        let splits: Vec<SplitView> = self.order.iter().map(split).collect();
-        let groups: Vec<&GroupRef> = self.ledger.waiting().collect();
-        let mut waiting: BTreeMap<u32, Vec<Waiting>> = BTreeMap::new();
-        let mut reduce = Vec::new();
-        for (id, group) in groups.iter().enumerate() {
-            let entry = Waiting { id, rays: u64::from(group.rays) };
-            match group.to {
-                Destination::Split(s) => waiting.entry(self.rank[s as usize]).or_default().push(entry),
-                Destination::Reduce(_) => reduce.push(entry),
-            }
-        }
-        let mut view = View {
-            strategy: settings.strategy,
-            splits: &splits,
-            nodes: &self.nodes_as_seen(),
-            waiting,
-            reduce,
-            camera: self.cameras.rays(),
-            task_rays: self.rate.rays(settings.task_seconds),
-            task_camera: self.rate.camera(settings.task_seconds),
-            least_rays: u64::from(settings.batch),
-            replicas: settings.replicas,
-            forest: FOREST_BYTES,
-            cut: self.cut.as_deref().unwrap_or_default(),
-            traffic: self.traffic,
-        };
-        // a new cut is worth a thought when nothing is under way that was made for the old one
-        let (mut cut, nodes) = (None, view.nodes.iter().map(|n| NodeView { warm: BTreeSet::new(), ..n.clone() }));
-        let nodes: Vec<NodeView> = nodes.collect();
-        if settings.strategy == plan::Strategy::Auto
-            && (self.cut.is_none() || (self.live.is_empty() && groups.is_empty()))
-        {
-            cut = Some(plan::cut::choose(&view)).filter(|c| Some(c) != self.cut.as_ref());
-        }
-        if let Some(cut) = &cut {
-            (view.cut, view.nodes) = (cut, &nodes);
-        }
-        let plan = plan::plan(&view);
-        let keys = |a: &Assignment| a.groups.iter().map(|&g| groups[g].key.clone()).collect();
-        let plan = plan.into_iter().map(|a| (keys(&a), a)).map(|(keys, a)| (a, keys)).collect();
-        if cut.is_some() {
-            self.windows.iter_mut().for_each(BTreeSet::clear);
-            self.cut = cut;
-        }
-        plan
-    }
-
-    /// The nodes as the planner sees them.
-    fn nodes_as_seen(&self) -> Vec<NodeView> {
-        let settings = self.shared.settings;
-        let node = |(n, spec): (usize, &NodeSpec)| {
-            let memory = self.shared.nodes.memory(n as u32);
-            let warm = if settings.strategy == plan::Strategy::Auto {
-                self.windows[n].clone()
-            } else {
-                memory.warm().into_iter().map(|s| self.rank[s as usize]).collect()
-            };
-            NodeView { slots: spec.slots, free: self.free[n], memory: memory.capacity(), warm }
-        };
-        settings.nodes.iter().enumerate().map(node).collect()
-    }
-
-    /// Remembers the window that a node of `auto` is to hold: beside what it holds if there is room, else instead of it.
-    fn hold(&mut self, node: u32, ranks: &[u32]) {
-        let scene = self.shared.scene;
-        let held = &mut self.windows[node as usize];
-        let both: BTreeSet<u32> = held.iter().chain(ranks).copied().collect();
-        let bytes: u64 = both.iter().map(|&r| scene.split_bytes(self.order[r as usize])).sum();
-        let beside = bytes <= self.shared.nodes.memory(node).capacity() && !self.cut.as_ref().is_none_or(Vec::is_empty);
-        *held = if beside { both } else { ranks.iter().copied().collect() };
-    }
-
-    /// Starts a task as planned; false if there was nothing left for it to do.
-    fn start<'scope>(
-        &mut self,
-        scope: &'scope Scope<'scope, '_>,
-        (plan, groups): (Assignment, Vec<String>),
-    ) -> Result<bool, JobError>
-    where
-        's: 'scope,
-        'a: 'scope,
-    {
-        let camera = plan.camera.map_or_else(Vec::new, |(rays, from)| self.cameras.take(rays, &from));
-        if groups.is_empty() && camera.is_empty() {
-            return Ok(false);
-        }
-        let set = match plan.set {
-            Set::Resident(ranks) => {
-                self.hold(plan.node, &ranks);
-                let mut splits: Vec<u32> = ranks.into_iter().map(|r| self.order[r as usize]).collect();
-                splits.sort_unstable();
-                Set::Resident(splits)
-            }
-            Set::Sharing(rank) => Set::Sharing(self.order[rank as usize]),
-            other => other,
-        };
-        let (task, groups) = self.ledger.start(&Inputs { groups, camera: camera.clone() })?;
-        let name = format!("{}-t{:08}", self.session, task.0);
-        let spec = Attempt { name, node: plan.node, set, groups, camera };
-        let node = plan.node;
-        self.running.insert(task, Running { spec, started: Instant::now(), attempts: 0 });
-        self.launch(scope, task, node);
-        Ok(true)
-    }
-
-    /// Starts an attempt of a running task on a thread of its own.
-    fn launch<'scope>(&mut self, scope: &'scope Scope<'scope, '_>, task: TaskId, node: u32)
-    where
-        's: 'scope,
-        'a: 'scope,
-    {
-        let Some(running) = self.running.get_mut(&task) else { return };
-        let number = running.attempts;
-        running.attempts += 1;
-        let attempt = Attempt { name: format!("{}-a{number}", running.spec.name), node, ..running.spec.clone() };
-        let ordinal = self.launched;
-        self.launched += 1;
-        let fate = self.faults.map_or(Fate::Fine, |f| f.fate(ordinal));
-        let stop = StopFlag::new(if let Fate::Kill(batches) = fate { Some(batches) } else { None });
-        self.free[node as usize] -= 1;
-        self.live.insert((task, number), Live { node, stop: stop.clone(), ordinal });
-        let (shared, gate, send) = (self.shared, self.gate, self.send.clone());
-        scope.spawn(move || {
-            if let Fate::Delay(time) = fate {
-                std::thread::sleep(time);
-            }
-            let permit = gate.enter();
-            let before = usage::thread_cpu();
-            // a panic must end the job with a message, not leave it waiting
-            let result = catch_unwind(AssertUnwindSafe(|| run(shared, &attempt, &stop)))
-                .unwrap_or_else(|_| Err(JobError::Internal("a task panicked".into())));
-            let cpu = usage::thread_cpu() - before;
-            drop(permit);
-            // nobody listens when the job has failed
-            let _ = send.send(Message { task, number, result, cpu });
-        });
-    }
-
-    /// Starts a second attempt of tasks that take much longer than others did, where nothing else is to be done.
-    fn second_attempts<'scope>(&mut self, scope: &'scope Scope<'scope, '_>)
-    where
-        's: 'scope,
-        'a: 'scope,
-    {
-        let settings = self.shared.settings;
-        let late = settings.straggler_seconds.max(3.0 * settings.task_seconds);
-        let slow = self.running.iter().filter(|(_, r)| r.attempts < 2 && r.started.elapsed().as_secs_f64() > late);
-        let slow: Vec<TaskId> = slow.map(|(&t, _)| t).collect();
-        for task in slow {
-            if !self.gate.has_room() {
-                return;
-            }
-            let Some(first) = self.live.iter().find(|(k, _)| k.0 == task).map(|(_, l)| l.node) else { continue };
-            let same_window = |n: u32| match &self.running[&task].spec.set {
-                Set::Resident(set) if settings.strategy == plan::Strategy::Auto => {
-                    let held = &self.windows[n as usize];
-                    let moving = self.cut.as_ref().is_none_or(Vec::is_empty);
-                    set.iter().all(|&s| held.contains(&self.rank[s as usize])) && (!moving || held.len() == set.len())
-                }
-                _ => true,
-            };
-            let nodes = (0..self.free.len() as u32).filter(|&n| self.free[n as usize] > 0 && same_window(n));
-            // on another node, if there is one
-            if let Some(node) = nodes.max_by_key(|&n| (n != first, self.free[n as usize]))
-                && self.ledger.again(task).is_ok()
-            {
-                self.launch(scope, task, node);
-            }
-        }
-    }
-
-    fn handle(&mut self, message: Message) -> Result<(), JobError> {
-        let Message { task, number, result, cpu } = message;
-        let Some(live) = self.live.remove(&(task, number)) else {
-            return Err(JobError::Internal("an attempt reports that was never started".into()));
-        };
-        self.free[live.node as usize] += 1;
-        self.shared.nodes.busy(live.node, cpu);
-        let fate = self.faults.map_or(Fate::Fine, |f| f.fate(live.ordinal));
-        let made = match result {
-            Ok(made) => made,
-            Err(JobError::Stopped) => return self.lost(task, number),
-            // what a task that does not run any more read may be gone by right
-            Err(e @ JobError::Lost { .. }) if self.running.contains_key(&task) => return self.go_back(&e),
-            Err(JobError::Lost { .. }) => return Ok(()),
-            Err(e) => return Err(e),
-        };
-        match fate {
-            Fate::LoseResult => {
-                self.discard(&made.outputs)?;
-                return self.lost(task, number);
-            }
-            Fate::LoseNode => {
-                self.lost(task, number)?;
-                return self.lose_node(live.node);
-            }
-            Fate::Corrupt => self.corrupt(live.ordinal, &made.outputs)?,
-            _ => {}
-        }
-        let twice = (fate == Fate::Duplicate).then(|| Made {
-            film: made.film.clone(),
-            outputs: made.outputs.clone(),
-            hops: made.hops,
-        });
-        self.commit(task, number, made, cpu)?;
-        match twice {
-            Some(made) => self.commit(task, number, made, cpu),
-            None => Ok(()),
-        }
-    }
-
-    /// An attempt that does not count. If it was the task's last one, its inputs wait again.
-    fn lost(&mut self, task: TaskId, number: u32) -> Result<(), JobError> {
-        if self.ledger.lost(task, number)
-            && let Some(running) = self.running.remove(&task)
-        {
-            self.cameras.give_back(&running.spec.camera);
-        }
-        Ok(())
-    }
-
-    fn commit(&mut self, task: TaskId, number: u32, made: Made, cpu: f64) -> Result<(), JobError> {
-        let settled = self.ledger.is_settled();
-        let record = match self.ledger.record(task, made.outputs.clone()) {
-            Ok(record) => record,
-            // beaten by another attempt, or arrived twice
-            Err(Refused::NotRunning(_)) if self.committed.contains(&(task, number)) => return Ok(()),
-            Err(Refused::NotRunning(_)) => return self.discard(&made.outputs),
-            Err(e) => return Err(e.into()),
-        };
-        if settled && !record.made.groups.is_empty() {
-            self.settled = (self.ledger.snapshot(None), self.film.clone());
-        }
-        let name = self.write(&record)?;
-        self.ledger.commit(task, &record, name)?;
-        self.committed.insert((task, number));
-        self.film.merge(&made.film)?;
-        let made_rays = record.made.rays;
-        self.rate.add(cpu, made_rays.closest + made_rays.shadow, made_rays.camera);
-        self.tasks += 1;
-        let bytes = record.made.groups.iter().map(|g| g.bytes).sum::<u64>();
-        let windows = self.cut.as_ref().map_or(0, Vec::len).max(1);
-        self.traffic.add(made_rays.camera, made_rays.closest + made_rays.shadow, windows, made.hops, bytes);
-        self.hops += made.hops;
-        self.hop_bytes += bytes;
-        if let Some(film) = record.made.film {
-            if self.owner.is_some() {
-                self.superfluous[1].push((film.key, film.holders));
-            } else {
-                self.shared.nodes.delete(&[(film.key, film.holders)])?;
-            }
-        }
-        if let Some(running) = self.running.remove(&task) {
-            self.live.iter().filter(|(k, _)| k.0 == task).for_each(|(_, l)| l.stop.set());
-            let consumed: Objects = running.spec.groups.into_iter().map(|g| (g.key, g.holders)).collect();
-            self.shared.nodes.delete(&consumed)?;
-        }
-        if self.owner.is_some() && self.tasks.is_multiple_of(SNAPSHOT_EVERY) {
-            self.write_snapshot()?;
-        }
-        if self.progress.wants_preview() {
-            let spp = self.ledger.taken().reach().max(1);
-            self.progress.preview(&image(&self.film, spp));
-        }
-        Ok(())
-    }
-
-    /// Makes a record durable, if the job keeps records; its name.
-    fn write(&mut self, record: &Record) -> Result<String, JobError> {
-        if self.owner.is_none() {
-            return Ok(record.sequence.to_string());
-        }
-        let name = journal::write(&self.shared.nodes, record)?;
-        self.old_records[1].push(journal::key(record.sequence, &name));
-        Ok(name)
-    }
-
-    /// Writes the whole state, and deletes what the snapshot before this one made superfluous.
-    fn write_snapshot(&mut self) -> Result<(), JobError> {
-        let nodes = &self.shared.nodes;
-        let key = format!("film/{}-s{:08}", self.session, self.ledger.commits());
-        let film = journal::store_film(nodes, &self.film, &key)?;
-        let record = self.ledger.record_of(self.ledger.snapshot(film.clone()));
-        let [old, new] = std::mem::take(&mut self.superfluous);
-        let [old_records, new_records] = std::mem::take(&mut self.old_records);
-        let name = self.write(&record)?;
-        self.ledger.follow_snapshot(&record, name)?;
-        nodes.delete(&old)?;
-        nodes.wait(nodes.store().delete(&old_records))?;
-        self.superfluous = [new, film.into_iter().map(|f| (f.key, f.holders)).collect()];
-        self.old_records[0] = new_records;
-        Ok(())
-    }
-
-    /// Rays were lost with all their copies: back to the last state without rays on their way.
-    fn go_back(&mut self, why: &JobError) -> Result<(), JobError> {
-        tracing::warn!("{why}; what was committed since no ray was on its way is computed again");
-        let before: Objects = self.ledger.snapshot(None).waiting.into_iter().map(|g| (g.key, g.holders)).collect();
-        let (mut snapshot, film) = self.settled.clone();
-        self.redone += self.ledger.commits() - snapshot.commits;
-        if self.owner.is_some() {
-            let key = format!("film/{}-b{:08}-{}", self.session, self.ledger.commits(), self.redone);
-            snapshot.film = journal::store_film(&self.shared.nodes, &film, &key)?;
-        }
-        let record = self.ledger.record_of(snapshot);
-        let name = self.write(&record)?;
-        self.ledger.go_back(&record, name)?;
-        self.film = film;
-        self.stop_all();
-        self.running.clear();
-        self.cameras.clear();
-        self.cameras.add(0..self.queued, self.ledger.taken());
-        self.shared.nodes.delete(&before)
-    }
-
-    /// A node is gone with its disk and what ran on it, and comes back empty. What has other copies is copied again.
-    fn lose_node(&mut self, node: u32) -> Result<(), JobError> {
-        let nodes = &self.shared.nodes;
-        nodes.lose(node)?;
-        self.windows[node as usize].clear();
-        self.live.values().filter(|l| l.node == node).for_each(|l| l.stop.set());
-        for group in self.ledger.snapshot(None).waiting {
-            if group.holders.contains(&node) {
-                let holders = nodes.copy_again(Kind::Rays, &group.key, &group.holders, node)?;
-                self.ledger.relocate(&group.key, holders);
-            }
-        }
-        if self.owner.is_some() {
-            // film parts may have lain there; the sums are here
-            self.write_snapshot()?;
-        }
-        Ok(())
-    }
-
-    /// Deletes what an attempt made that does not count.
-    fn discard(&mut self, outputs: &Outputs) -> Result<(), JobError> {
-        let groups = outputs.groups.iter().map(|g| (g.key.clone(), g.holders.clone()));
-        let film = outputs.film.iter().map(|f| (f.key.clone(), f.holders.clone()));
-        self.shared.nodes.delete(&groups.chain(film).collect::<Objects>())
-    }
-
-    /// A byte of one copy of something that an attempt made changes.
-    fn corrupt(&mut self, ordinal: u64, outputs: &Outputs) -> Result<(), JobError> {
-        let Some(faults) = self.faults else { return Ok(()) };
-        if outputs.groups.is_empty() {
-            return Ok(());
-        }
-        let group = &outputs.groups[faults.pick(ordinal, outputs.groups.len() as u64) as usize];
-        let holder = group.holders[faults.pick(ordinal + 1, group.holders.len() as u64) as usize];
-        self.shared.nodes.corrupt(holder, &group.key, faults.pick(ordinal + 2, group.bytes))
-    }
-
     fn stop_all(&mut self) {
         self.live.values().for_each(|l| l.stop.set());
-    }
-
-    fn tell(&self) {
-        let [w, h] = self.shared.frame.size;
-        let pixels = u64::from(w) * u64::from(h);
-        let rays = self.ledger.rays();
-        self.progress.status(&Status {
-            elapsed: self.start.elapsed(),
-            rays,
-            samples: rays.camera,
-            samples_total: pixels * u64::from(self.sampling.spp),
-            waiting: self.ledger.waiting().map(|g| u64::from(g.rays)).sum(),
-            rounds: if self.shared.settings.has_barrier() { self.rounds } else { self.ledger.commits() },
-            error: self.error,
-        });
-    }
-
-    fn finish(mut self) -> Result<JobOutcome, JobError> {
-        if self.owner.is_some() {
-            self.write_snapshot()?;
-        }
-        if let Some(owner) = &self.owner {
-            let nodes = &self.shared.nodes;
-            nodes.wait(owner.give_back(nodes.store().as_ref()))?;
-        }
-        let spp = self.ledger.done().complete();
-        let [width, height] = self.shared.frame.size;
-        let settings = self.shared.settings;
-        let counts = &self.shared.scene.manifest.counts;
-        let rel_mse = self.film.rel_mse(spp);
-        let (bytes, nodes_detail) = self.shared.nodes.report();
-        let skipped = [
-            ("degenerate", counts.degenerate),
-            ("non_finite", counts.non_finite),
-            ("out_of_range", counts.out_of_range),
-        ];
-        let mut report = Report {
-            strategy: settings.strategy.name().to_owned(),
-            nodes: settings.nodes.len() as u32,
-            slots: settings.slots(),
-            rounds: if settings.has_barrier() { self.rounds } else { self.tasks },
-            tasks: self.tasks,
-            tasks_redone: self.redone,
-            tasks_reused: self.reused,
-            attempts_lost: self.ledger.attempts_lost(),
-            wall_s: self.start.elapsed().as_secs_f64(),
-            cpu_s: usage::process_cpu(),
-            spp,
-            samples: u64::from(width) * u64::from(height) * u64::from(spp),
-            rays: self.ledger.rays(),
-            scene_bytes: self.shared.scene.manifest.scene_bytes(),
-            hops: self.hops,
-            bytes_per_hop: (self.hops > 0).then(|| self.hop_bytes as f64 / self.hops as f64),
-            peak_memory_bytes: usage::peak_memory(),
-            non_finite: self.film.rejected().count,
-            rel_mse,
-            target_reached: self.sampling.target_error.map(|t| rel_mse.is_some_and(|e| e <= t)),
-            nodes_detail,
-            skipped: skipped.into_iter().map(|(k, v)| (k.to_owned(), v)).collect(),
-            ..Report::default()
-        };
-        report.set_bytes(&bytes);
-        for (pixel, sample) in &self.film.rejected().keys {
-            let (x, y) = (pixel % width, pixel / width);
-            tracing::warn!("pixel {x},{y} sample {sample}: a contribution is not finite or too large");
-        }
-        Ok(JobOutcome { image: image(&self.film, spp), film: self.film, spp, report })
     }
 }
 

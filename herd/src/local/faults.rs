@@ -13,6 +13,8 @@ pub enum Fate {
     LoseNode,
     /// It starts late.
     Delay(Duration),
+    /// Its result arrives only after its task was committed by another attempt (never by chance: see [`Faults::only`]).
+    Straggle,
     /// Its result arrives twice.
     Duplicate,
     /// Its result never arrives.
@@ -25,6 +27,7 @@ pub enum Fate {
 #[derive(Clone, Copy, Debug)]
 pub struct Faults {
     seed: u64,
+    only: Option<(u64, Fate)>,
 }
 
 /// Attempts that may be hit, counted over the whole job: so that every schedule comes to an end.
@@ -33,11 +36,18 @@ const MOST: u64 = 40;
 impl Faults {
     /// The schedule of a seed.
     pub fn new(seed: u64) -> Self {
-        Faults { seed }
+        Faults { seed, only: None }
+    }
+    /// One fault: what befalls the `n`-th attempt of the job, and nothing else.
+    pub fn only(n: u64, fate: Fate) -> Self {
+        Faults { seed: 0, only: Some((n, fate)) }
     }
 
     /// What befalls the `n`-th attempt of the job. About half of the early ones are hit.
     pub fn fate(&self, n: u64) -> Fate {
+        if let Some((which, fate)) = self.only {
+            return if n == which { fate } else { Fate::Fine };
+        }
         let x = mix(self.seed ^ mix(n));
         // each seed has a mixture of its own
         let rate = mix(self.seed) % 8;

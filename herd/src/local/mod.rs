@@ -2,6 +2,7 @@
 
 pub mod attempt;
 mod cameras;
+mod disks;
 mod driver;
 pub mod faults;
 pub mod journal;
@@ -12,10 +13,11 @@ mod slots;
 mod tests;
 mod usage;
 
+pub use driver::render_local;
 use rayherd_render::film::FilmPart;
 use rayherd_render::frame::Frame;
 
-use crate::job::{Image, JobError, JobSettings, PreparedScene, Progress, Sampling};
+use crate::job::{Image, JobError, JobSettings, PreparedScene, Sampling};
 use crate::report::Report;
 
 pub use journal::{Collected, collect};
@@ -30,22 +32,6 @@ pub struct JobOutcome {
     pub spp: u32,
     /// What was done and counted.
     pub report: Report,
-}
-
-/// Renders a frame of a prepared scene on virtual nodes in this process.
-///
-/// The image is a function of (scene, frame, samples) alone, to the byte: not of the settings, not of time.
-///
-/// # Errors
-/// When settings, scene or store do not allow it; see [`JobError`].
-pub fn render_local(
-    scene: &PreparedScene,
-    frame: &Frame,
-    sampling: &Sampling,
-    settings: &JobSettings,
-    progress: &dyn Progress,
-) -> Result<JobOutcome, JobError> {
-    driver::render(scene, frame, sampling, settings, progress)
 }
 
 /// Checks what can be checked before anything is read.

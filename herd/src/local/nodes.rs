@@ -1,7 +1,8 @@
 //! Virtual nodes: memory, disk and network of each, with every byte counted.
 //!
-//! A node's disk is a folder of the job's store (`nodes/N/..`). Blocks of the scene stay in the store where they were
-//! prepared; which nodes count as holding a copy is kept here, and a read from another node counts as remote.
+//! A node's ray groups and film parts are in the job's store, in a folder for each node (`nodes/N/..`); its copies of the
+//! scene's blocks are files on its [disk](super::disks) when there is more than one node. A single node reads blocks where
+//! they were prepared.
 
 use std::sync::{Arc, Mutex, PoisonError, RwLock};
 
@@ -9,6 +10,7 @@ use bytes::Bytes as Body;
 use rayherd_scene::objects::ObjectRef;
 use tokio::runtime::Runtime;
 
+use super::disks::Disks;
 use crate::job::{JobError, JobSettings, PreparedScene};
 use crate::plan::place;
 use crate::report::{Bytes, Kind, NodeReport, Op, Place, Stage};
@@ -23,6 +25,8 @@ pub struct Nodes<'a> {
     runtime: Runtime,
     replicas: u32,
     memories: Vec<Memory>,
+    /// None for a single node.
+    disks: Option<Disks>,
     /// Nodes that hold a split, by split number.
     holders: RwLock<Vec<Vec<u32>>>,
     counts: Mutex<Counts>,
@@ -50,7 +54,9 @@ impl<'a> Nodes<'a> {
         }
         let memory = settings.memory_per_node.unwrap_or(u64::MAX);
         let nodes = settings.nodes.iter().map(|n| NodeReport { slots: n.slots, ..NodeReport::default() }).collect();
+        let disks = (count > 1).then(|| Disks::new(count as usize, replicas as usize)).transpose()?;
         Ok(Nodes {
+            disks,
             scene,
             store,
             runtime,
@@ -201,24 +207,29 @@ impl<'a> Nodes<'a> {
         self.wait(self.store.delete(&keys))?;
         self.memories[node as usize].clear();
         let count = self.memories.len() as u32;
-        let mut holders = self.holders.write().unwrap_or_else(PoisonError::into_inner);
-        for (split, on) in holders.iter_mut().enumerate() {
-            let before = on.len();
-            on.retain(|&h| h != node);
-            // copied again, to the first node without a copy; from where the scene was prepared if there is none left
-            if on.len() < before
-                && let Some(to) = (1..=count).map(|k| (node + k) % count).find(|n| !on.contains(n))
-            {
-                on.push(to);
-                let entry = &self.scene.manifest.splits[split];
-                for (kind, bytes) in
-                    [(Kind::Geometry, entry.geometry.bytes), (Kind::Attributes, entry.attributes.bytes)]
+        let mut moved = Vec::new();
+        {
+            let mut holders = self.holders.write().unwrap_or_else(PoisonError::into_inner);
+            for (split, on) in holders.iter_mut().enumerate() {
+                let before = on.len();
+                on.retain(|&h| h != node);
+                // copied again, to the first node without a copy; from where the scene was prepared if there is none left
+                if on.len() < before
+                    && let Some(to) = (1..=count).map(|k| (node + k) % count).find(|n| !on.contains(n))
                 {
-                    self.count(Stage::Trace, Op::Write, kind, to, Place::Remote, bytes);
+                    on.push(to);
+                    let entry = &self.scene.manifest.splits[split];
+                    for (kind, object) in [(Kind::Geometry, &entry.geometry), (Kind::Attributes, &entry.attributes)] {
+                        self.count(Stage::Trace, Op::Write, kind, to, Place::Remote, object.bytes);
+                        moved.push((kind, object, on.clone()));
+                    }
                 }
             }
         }
-        Ok(())
+        match &self.disks {
+            Some(disks) => self.wait(disks.lose(node, moved.into_iter())),
+            None => Ok(()),
+        }
     }
 }
 
@@ -235,12 +246,17 @@ pub struct NodeBlocks<'n, 'a> {
 
 impl NodeBlocks<'_, '_> {
     fn read(&self, split: u32, kind: Kind, object: &ObjectRef) -> Result<Vec<u8>, JobError> {
-        let bytes = self.nodes.scene.objects.get(object)?;
-        let local =
-            self.nodes.holders.read().unwrap_or_else(PoisonError::into_inner)[split as usize].contains(&self.node);
-        let place = if local { Place::Local } else { Place::Remote };
-        self.nodes.count(Stage::Trace, Op::Read, kind, self.node, place, bytes.len() as u64);
-        Ok(bytes)
+        let (nodes, node) = (self.nodes, self.node);
+        let Some(disks) = &nodes.disks else {
+            let bytes = nodes.scene.objects.get(object)?;
+            nodes.count(Stage::Trace, Op::Read, kind, node, Place::Local, bytes.len() as u64);
+            return Ok(bytes);
+        };
+        let holders = nodes.holders.read().unwrap_or_else(PoisonError::into_inner)[split as usize].clone();
+        let read = disks.read(node, (kind, object), &holders, nodes.scene.objects.as_ref());
+        let (body, counted) = nodes.wait(read)?;
+        counted.rows().iter().for_each(|r| nodes.count(r.stage, r.op, r.kind, node, r.place, r.bytes));
+        Ok(body.into())
     }
     /// Counts a use of splits that are in memory already.
     pub fn count_warm(&self, splits: &[u32]) {

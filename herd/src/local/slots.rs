@@ -46,6 +46,7 @@ impl Drop for Permit<'_> {
 #[derive(Clone)]
 pub struct StopFlag {
     stop: Arc<AtomicBool>,
+    changed: Arc<(Mutex<()>, Condvar)>,
     /// Checks that are left before it stops of itself; none for no such end.
     left: Option<Arc<AtomicU32>>,
 }
@@ -53,11 +54,20 @@ pub struct StopFlag {
 impl StopFlag {
     /// Stops when it is set, or after so many batches.
     pub fn new(batches: Option<u32>) -> Self {
-        StopFlag { stop: Arc::default(), left: batches.map(|n| Arc::new(AtomicU32::new(n))) }
+        StopFlag { stop: Arc::default(), changed: Arc::default(), left: batches.map(|n| Arc::new(AtomicU32::new(n))) }
     }
     /// The attempt ends at its next batch.
     pub fn set(&self) {
+        let _held = self.changed.0.lock().unwrap_or_else(PoisonError::into_inner);
         self.stop.store(true, Ordering::Relaxed);
+        self.changed.1.notify_all();
+    }
+    /// Waits until it is set.
+    pub fn wait(&self) {
+        let mut held = self.changed.0.lock().unwrap_or_else(PoisonError::into_inner);
+        while !self.stop.load(Ordering::Relaxed) {
+            held = self.changed.1.wait(held).unwrap_or_else(PoisonError::into_inner);
+        }
     }
 }
 

@@ -5,7 +5,7 @@ use std::sync::{Arc, LazyLock};
 use rayherd_render::bvh::{Kernel, Tracer};
 
 use super::*;
-use crate::job::{Commits, NodeSpec, Silent};
+use crate::job::{Commits, NodeSpec, Progress, Silent};
 use crate::plan::Strategy;
 use crate::store::{BlockStore, MemoryStore};
 use crate::testing;
@@ -300,6 +300,85 @@ fn corrupt_objects_are_found_and_computed_again() {
     }
 }
 
+#[test]
+fn a_straggler_is_beaten_by_a_second_attempt_and_leaves_nothing() {
+    for strategy in Strategy::ALL {
+        let store = Arc::new(MemoryStore::default());
+        // whatever runs while a slot is idle gets a second attempt; the first one of all reports only once it is beaten
+        let settings = JobSettings {
+            memory_per_node: Some(2 * largest(&SCENES[1])),
+            straggler_seconds: Some(0.0),
+            threads: NonZeroU32::new(2),
+            faults: Some(faults::Faults::only(0, faults::Fate::Straggle)),
+            ..small(strategy, &[1, 1])
+        };
+        let made =
+            render_local(&SCENES[1], &frame(), &sampling(5), &with_store(&store, false, settings), &Silent).unwrap();
+        assert!(made.film == *expected(5), "{strategy}");
+        assert!(made.report.attempts_lost > 0 && made.report.tasks_redone == 0, "{strategy}: {:?}", made.report);
+        let runtime = tokio::runtime::Builder::new_current_thread().build().unwrap();
+        let left = runtime.block_on(store.list("nodes/")).unwrap();
+        assert!(!left.is_empty() && !left.iter().any(|k| k.0.contains("t00000000-a0")), "{strategy}: {left:?}");
+    }
+}
+
+/// Ends a job when it has made some commits.
+struct Impatient {
+    after: u64,
+    commits: std::sync::atomic::AtomicU64,
+}
+
+impl Progress for Impatient {
+    fn status(&self, status: &crate::job::Status) {
+        self.commits.store(status.rounds, std::sync::atomic::Ordering::Relaxed);
+    }
+    fn is_cancelled(&self) -> bool {
+        self.commits.load(std::sync::atomic::Ordering::Relaxed) >= self.after
+    }
+}
+
+#[test]
+fn a_job_that_is_told_to_end_keeps_what_is_committed_and_gives_the_store_back() {
+    let store = Arc::new(MemoryStore::default());
+    let settings = JobSettings { memory_per_node: Some(2 * largest(&SCENES[1])), ..small(Strategy::Auto, &[1]) };
+    let impatient = Impatient { after: 3, commits: Default::default() };
+    let stopped =
+        render_local(&SCENES[1], &frame(), &sampling(5), &with_store(&store, false, settings.clone()), &impatient);
+    assert!(matches!(stopped, Err(JobError::Cancelled)));
+    let runtime = tokio::runtime::Builder::new_current_thread().build().unwrap();
+    assert!(runtime.block_on(store.list("owner")).unwrap().is_empty());
+    let made = render_local(&SCENES[1], &frame(), &sampling(5), &with_store(&store, true, settings), &Silent).unwrap();
+    assert!(made.film == *expected(5) && made.report.tasks_reused >= 3);
+}
+
+#[test]
+fn what_is_the_networks_is_not_the_users() {
+    let at = || ("s3://b".to_owned(), "owner".to_owned());
+    let unavailable = |(store, key): (String, String)| crate::store::StoreError::Unavailable {
+        store,
+        action: "get",
+        key,
+        message: "connection refused".into(),
+    };
+    let denied = |(store, key): (String, String)| crate::store::StoreError::Denied {
+        store,
+        action: "get",
+        key,
+        message: "InvalidAccessKeyId".into(),
+    };
+    let object = |source: crate::store::StoreError| {
+        JobError::Object(rayherd_scene::objects::ObjectError::Failed {
+            store: "s3://b".into(),
+            action: "read".into(),
+            source: Box::new(source),
+        })
+    };
+    assert!(!JobError::Store(unavailable(at())).is_users() && !object(unavailable(at())).is_users());
+    assert!(JobError::Store(denied(at())).is_users() && object(denied(at())).is_users());
+    assert!(!JobError::Lost { name: "rays/a".into(), why: "gone".into() }.is_users());
+    assert!(JobError::Settings("no".into()).is_users());
+}
+
 /// Random settings and faults from a seed; replay one with `RAYHERD_FAULT_SEED=n cargo test -p rayherd-herd random_faults`.
 fn random_case(seed: u64) -> (&'static PreparedScene, JobSettings) {
     let pick = |i: u64, n: u64| faults::Faults::new(seed ^ 0x5eed).pick(i, n);
@@ -312,12 +391,12 @@ fn random_case(seed: u64) -> (&'static PreparedScene, JobSettings) {
         replicas: 1 + pick(3, slots.len().min(3) as u64) as u32,
         barrier: [None, Some(true), Some(false)][pick(4, 3) as usize],
         task_seconds: [0.002, 0.01, 10.0][pick(5, 3) as usize],
-        straggler_seconds: 0.01,
+        straggler_seconds: Some(0.01),
         threads: NonZeroU32::new(1 + pick(6, 3) as u32),
         kernel: kernels[pick(7, kernels.len() as u64) as usize],
         batch: [30, 300, 4000][pick(8, 3) as usize],
         ray_buffer: [1 << 14, 1 << 20][pick(9, 2) as usize],
-        faults: Some(seed),
+        faults: Some(faults::Faults::new(seed)),
         ..small(Strategy::ALL[pick(10, 4) as usize], &slots)
     };
     let settings =

@@ -1,6 +1,5 @@
 //! Where blocks, ray groups and film parts live: one trait, several backends, layers around them.
 
-mod caching;
 #[cfg(any(test, feature = "testing"))]
 pub mod conformance;
 mod counting;
@@ -15,21 +14,22 @@ mod retrying;
 mod s3;
 #[cfg(any(test, feature = "testing"))]
 pub mod s3_server;
+mod spilling;
 
 use async_trait::async_trait;
 use bytes::Bytes;
 
-pub use caching::Caching;
 pub use counting::{Counters, Counting, kind_of_key};
 pub use directory::DirectoryStore;
 pub use faulty::{FaultPlan, Faulty, Injected};
 pub use key::{check_key, check_prefix};
 pub use memory::MemoryStore;
-pub use objects::{SceneObjects, object_key};
+pub use objects::{SceneObjects, object_is_users, object_key};
 pub use prefixed::Prefixed;
 pub use replicated::{NodeView, Replicated, ReplicationCounts, Verify};
 pub use retrying::{RetryPolicy, Retrying};
 pub use s3::{S3Credentials, S3Settings, S3Store};
+pub use spilling::{Spilling, temporary_folder};
 
 /// A flat space of named, immutable objects.
 ///
@@ -125,4 +125,19 @@ pub enum StoreError {
         /// Which rule.
         message: String,
     },
+}
+
+impl StoreError {
+    /// Whether the caller can put it right: by another address, key or bucket, or by making again what is gone. Otherwise it
+    /// is the network's or the machine's.
+    pub fn is_users(&self) -> bool {
+        match self {
+            StoreError::Unavailable { .. } | StoreError::Full { .. } => false,
+            StoreError::NotFound { .. }
+            | StoreError::Denied { .. }
+            | StoreError::Corrupt { .. }
+            | StoreError::InvalidKey { .. }
+            | StoreError::Misconfigured { .. } => true,
+        }
+    }
 }

@@ -20,6 +20,23 @@ pub struct SceneObjects {
     runtime: Handle,
 }
 
+/// Whether the user can put right what a scene's objects suffer from; see [`StoreError::is_users`].
+pub fn object_is_users(error: &ObjectError) -> bool {
+    use std::io::ErrorKind::{InvalidFilename, InvalidInput, IsADirectory, NotADirectory, NotFound, PermissionDenied};
+    match error {
+        // what is gone or broken is prepared again, as the message says
+        ObjectError::Missing { .. } | ObjectError::Corrupt { .. } | ObjectError::Name { .. } => true,
+        ObjectError::Failed { source, .. } => match (source.downcast_ref(), source.downcast_ref::<std::io::Error>()) {
+            (Some(store), _) => StoreError::is_users(store),
+            (_, Some(io)) => matches!(
+                io.kind(),
+                NotFound | PermissionDenied | NotADirectory | IsADirectory | InvalidInput | InvalidFilename
+            ),
+            _ => false,
+        },
+    }
+}
+
 /// Key of an object.
 pub fn object_key(hash: &ObjectHash) -> String {
     let hex = hash.to_string();

@@ -1,0 +1,177 @@
+//! Disks of virtual nodes: a folder each, with the copies of the scene's blocks that lie there as files.
+//!
+//! A block is copied to the nodes that are to hold it when it is asked for first, so a scene that is never read costs no
+//! room. What a node reads comes from its own folder or from another node's, checked against the block's hash; a copy that
+//! is broken or gone is passed over and made again from a good one.
+
+use std::collections::BTreeSet;
+use std::sync::Arc;
+
+use bytes::Bytes as Body;
+use rayherd_scene::objects::{ObjectHash, ObjectRef, ObjectStore};
+use tempfile::TempDir;
+use tokio::sync::Mutex;
+
+use crate::job::JobError;
+use crate::report::{Bytes, Kind, Stage};
+use crate::store::{BlockStore, Counters, DirectoryStore, Replicated, StoreError, temporary_folder};
+
+/// Locks of blocks that are being copied; more than there are threads.
+const LOCKS: usize = 64;
+
+/// The folders of all nodes, gone with this value.
+pub struct Disks {
+    copies: Arc<Replicated>,
+    /// Keys of the blocks that were copied to their nodes.
+    placed: Vec<Mutex<BTreeSet<String>>>,
+    #[cfg_attr(not(test), expect(dead_code, reason = "it goes when this is dropped"))]
+    folder: TempDir,
+}
+
+impl Disks {
+    /// Empty folders for so many nodes; each block will lie on `replicas` of them.
+    pub fn new(nodes: usize, replicas: usize) -> Result<Self, StoreError> {
+        let folder = temporary_folder("rayherd-nodes-")?;
+        let open = |n: usize| -> Result<Arc<dyn BlockStore>, StoreError> {
+            Ok(Arc::new(DirectoryStore::open_unsynced(folder.path().join(n.to_string()))?))
+        };
+        let stores = (0..nodes).map(open).collect::<Result<_, _>>()?;
+        let copies = Arc::new(Replicated::new(stores, replicas, Some(Arc::new(verify)))?);
+        Ok(Disks { copies, placed: (0..LOCKS).map(|_| Mutex::default()).collect(), folder })
+    }
+
+    /// The folder that holds those of the nodes, by number.
+    #[cfg(test)]
+    pub fn folder(&self) -> &std::path::Path {
+        self.folder.path()
+    }
+
+    fn placed(&self, object: &ObjectRef) -> &Mutex<BTreeSet<String>> {
+        &self.placed[usize::from(object.hash.0[0]) % LOCKS]
+    }
+
+    /// Reads a block for a node, and counts where from. `holders` are to have a copy; a block that lies on none yet is
+    /// copied there from where the scene was prepared.
+    pub async fn read(
+        &self,
+        node: u32,
+        (kind, object): (Kind, &ObjectRef),
+        holders: &[u32],
+        source: &dyn ObjectStore,
+    ) -> Result<(Body, Bytes), JobError> {
+        let key = key(kind, object);
+        let view = |counters| self.copies.view(Some(node as usize), counters);
+        let place = async || -> Result<(), JobError> {
+            let body = Body::from(source.get(object)?);
+            Ok(view(None).put_on(&indices(holders), &key, body).await?)
+        };
+        {
+            let mut placed = self.placed(object).lock().await;
+            if !placed.contains(&key) {
+                place().await?;
+                placed.insert(key.clone());
+            }
+        }
+        let counters = Counters::new();
+        let counted = view(Some((counters.clone(), Stage::Trace)));
+        let body = match counted.get(&key).await {
+            Err(e @ (StoreError::NotFound { .. } | StoreError::Corrupt { .. })) => {
+                tracing::warn!("{e}; it is copied again from where the scene was prepared");
+                place().await?;
+                counted.get(&key).await?
+            }
+            got => got?,
+        };
+        Ok((body, counters.sums()))
+    }
+
+    /// A node is gone with its disk; blocks that lay there are copied from others to their holders of now.
+    pub async fn lose<'b>(
+        &self,
+        node: u32,
+        blocks: impl Iterator<Item = (Kind, &'b ObjectRef, Vec<u32>)>,
+    ) -> Result<(), JobError> {
+        let disk = &self.copies.nodes()[node as usize];
+        let keys: Vec<String> = disk.list("").await?.into_iter().map(|k| k.0).collect();
+        disk.delete(&keys).await?;
+        self.copies.forget_node(node as usize);
+        for (kind, object, holders) in blocks {
+            let key = key(kind, object);
+            let mut placed = self.placed(object).lock().await;
+            if !placed.contains(&key) {
+                continue;
+            }
+            let view = self.copies.view(None, None);
+            match self.copies.any_copy(&key).await {
+                Ok(body) => view.put_on(&indices(&holders), &key, body).await?,
+                // the next who reads it copies it from where the scene was prepared
+                Err(StoreError::NotFound { .. } | StoreError::Corrupt { .. }) => {
+                    placed.remove(&key);
+                }
+                Err(e) => return Err(e.into()),
+            }
+        }
+        Ok(())
+    }
+}
+
+fn indices(nodes: &[u32]) -> Vec<usize> {
+    nodes.iter().map(|&n| n as usize).collect()
+}
+
+/// Key of a block: its kind, then its hash.
+fn key(kind: Kind, object: &ObjectRef) -> String {
+    let kind = if kind == Kind::Geometry { "geometry" } else { "attributes" };
+    format!("{kind}/{}", object.hash)
+}
+
+fn verify(key: &str, body: &[u8]) -> Result<(), String> {
+    let hash = ObjectHash::of(body).to_string();
+    if key.ends_with(&hash) { Ok(()) } else { Err(format!("its bytes hash to {hash}")) }
+}
+
+#[cfg(test)]
+mod tests {
+    use rayherd_scene::objects::{MemoryObjects, ObjectKind};
+
+    use super::*;
+    use crate::report::{Op, Place};
+
+    fn placed(bytes: &Bytes, op: Op) -> [u64; 2] {
+        [Place::Local, Place::Remote].map(|at| bytes.sum(|_, o, _, p| o == op && p == at))
+    }
+
+    #[tokio::test]
+    async fn copies_are_files_of_their_nodes_checked_and_made_again() {
+        let source = MemoryObjects::new();
+        let object = source.put(ObjectKind::Geometry, &[7; 1000]).unwrap();
+        let block = (Kind::Geometry, &object);
+        let disks = Disks::new(3, 2).unwrap();
+        let (root, hash) = (disks.folder().to_path_buf(), object.hash.to_string());
+        let file = |n: u32| root.join(n.to_string()).join("geometry").join(&hash);
+
+        let (body, counted) = disks.read(2, block, &[2, 1], &source).await.unwrap();
+        assert_eq!((body.len(), placed(&counted, Op::Read)), (1000, [1000, 0]));
+        assert_eq!([0, 1, 2].map(|n| file(n).is_file()), [false, true, true]);
+        let (_, counted) = disks.read(0, block, &[2, 1], &source).await.unwrap();
+        assert_eq!(placed(&counted, Op::Read), [0, 1000]);
+
+        // the own copy is broken: another node's is read, and written over it
+        std::fs::write(file(2), [8; 1000]).unwrap();
+        let (body, counted) = disks.read(2, block, &[2, 1], &source).await.unwrap();
+        assert_eq!((body[0], placed(&counted, Op::Read), placed(&counted, Op::Write)), (7, [0, 1000], [1000, 0]));
+        assert_eq!(std::fs::read(file(2)).unwrap(), [7; 1000]);
+
+        // a node is lost: what lay there lies on another one
+        disks.lose(1, [(Kind::Geometry, &object, vec![2, 0])].into_iter()).await.unwrap();
+        assert_eq!([0, 1, 2].map(|n| file(n).is_file()), [true, false, true]);
+        // all are lost: the scene as it was prepared is left
+        for n in [0, 2] {
+            disks.lose(n, std::iter::empty()).await.unwrap();
+        }
+        assert_eq!(disks.read(1, block, &[1, 2], &source).await.unwrap().0[0], 7);
+        assert_eq!([0, 1, 2].map(|n| file(n).is_file()), [false, true, true]);
+        drop(disks);
+        assert!(!root.exists());
+    }
+}

@@ -1,0 +1,150 @@
+//! From what an attempt reports to what counts.
+
+use std::sync::mpsc::Receiver;
+
+use super::{Driver, Message, Objects, image};
+use crate::job::JobError;
+use crate::ledger::{Record, Refused, TaskId};
+use crate::local::attempt::Made;
+use crate::local::faults::Fate;
+use crate::local::journal;
+
+/// Commits between two snapshots.
+const SNAPSHOT_EVERY: u64 = 16;
+
+impl Driver<'_, '_> {
+    pub(super) fn handle(&mut self, message: Message) -> Result<(), JobError> {
+        let Message { task, number, result, cpu } = message;
+        let Some(live) = self.live.remove(&(task, number)) else {
+            return Err(JobError::Internal("an attempt reports that was never started".into()));
+        };
+        self.free[live.node as usize] += 1;
+        self.shared.nodes.busy(live.node, cpu);
+        let fate = self.faults.map_or(Fate::Fine, |f| f.fate(live.ordinal));
+        let made = match result {
+            Ok(made) => made,
+            Err(JobError::Stopped) => return self.lost(task, number),
+            // what a task that does not run any more read may be gone by right
+            Err(e @ JobError::Lost { .. }) if self.running.contains_key(&task) => return self.go_back(&e),
+            Err(JobError::Lost { .. }) => return Ok(()),
+            Err(e) => return Err(e),
+        };
+        match fate {
+            Fate::LoseResult => {
+                self.discard(&made.outputs)?;
+                return self.lost(task, number);
+            }
+            Fate::LoseNode => {
+                self.lost(task, number)?;
+                return self.lose_node(live.node);
+            }
+            Fate::Corrupt => self.corrupt(live.ordinal, &made.outputs)?,
+            _ => {}
+        }
+        let twice = (fate == Fate::Duplicate).then(|| Made {
+            film: made.film.clone(),
+            outputs: made.outputs.clone(),
+            hops: made.hops,
+        });
+        self.commit(task, number, made, cpu)?;
+        match twice {
+            Some(made) => self.commit(task, number, made, cpu),
+            None => Ok(()),
+        }
+    }
+
+    /// An attempt that does not count. If it was the task's last one, its inputs wait again.
+    pub(super) fn lost(&mut self, task: TaskId, number: u32) -> Result<(), JobError> {
+        if self.ledger.lost(task, number)
+            && let Some(running) = self.running.remove(&task)
+        {
+            self.cameras.give_back(&running.spec.camera);
+        }
+        Ok(())
+    }
+
+    pub(super) fn commit(&mut self, task: TaskId, number: u32, made: Made, cpu: f64) -> Result<(), JobError> {
+        let settled = self.ledger.is_settled();
+        let record = match self.ledger.record(task, made.outputs.clone()) {
+            Ok(record) => record,
+            // beaten by another attempt, or arrived twice
+            Err(Refused::NotRunning(_)) if self.committed.contains(&(task, number)) => return Ok(()),
+            Err(Refused::NotRunning(_)) => return self.discard(&made.outputs),
+            Err(e) => return Err(e.into()),
+        };
+        if settled && !record.made.groups.is_empty() {
+            self.settled = (self.ledger.snapshot(None), self.film.clone());
+        }
+        let name = self.write(&record)?;
+        self.ledger.commit(task, &record, name)?;
+        self.committed.insert((task, number));
+        self.film.merge(&made.film)?;
+        let made_rays = record.made.rays;
+        self.rate.add(cpu, made_rays.closest + made_rays.shadow, made_rays.camera);
+        self.tasks += 1;
+        let bytes = record.made.groups.iter().map(|g| g.bytes).sum::<u64>();
+        let windows = self.cut.as_ref().map_or(0, Vec::len).max(1);
+        self.traffic.add(made_rays.camera, made_rays.closest + made_rays.shadow, windows, made.hops, bytes);
+        self.hops += made.hops;
+        self.hop_bytes += bytes;
+        if let Some(film) = record.made.film {
+            if self.owner.is_some() {
+                self.superfluous[1].push((film.key, film.holders));
+            } else {
+                self.shared.nodes.delete(&[(film.key, film.holders)])?;
+            }
+        }
+        if let Some(running) = self.running.remove(&task) {
+            self.live.iter().filter(|(k, _)| k.0 == task).for_each(|(_, l)| l.stop.set());
+            let consumed: Objects = running.spec.groups.into_iter().map(|g| (g.key, g.holders)).collect();
+            self.shared.nodes.delete(&consumed)?;
+        }
+        if self.owner.is_some() && self.tasks.is_multiple_of(SNAPSHOT_EVERY) {
+            self.write_snapshot()?;
+        }
+        if self.progress.wants_preview() {
+            let spp = self.ledger.taken().reach().max(1);
+            self.progress.preview(&image(&self.film, spp));
+        }
+        Ok(())
+    }
+
+    /// After the last thread has ended: deletes what attempts made that reported too late to count.
+    pub(super) fn discard_late(&self, receive: &Receiver<Message>) -> Result<(), JobError> {
+        for message in receive.try_iter() {
+            if let Ok(made) = message.result
+                && !self.committed.contains(&(message.task, message.number))
+            {
+                self.discard(&made.outputs)?;
+            }
+        }
+        Ok(())
+    }
+
+    /// Makes a record durable, if the job keeps records; its name.
+    pub(super) fn write(&mut self, record: &Record) -> Result<String, JobError> {
+        if self.owner.is_none() {
+            return Ok(record.sequence.to_string());
+        }
+        let name = journal::write(&self.shared.nodes, record)?;
+        self.old_records[1].push(journal::key(record.sequence, &name));
+        Ok(name)
+    }
+
+    /// Writes the whole state, and deletes what the snapshot before this one made superfluous.
+    pub(super) fn write_snapshot(&mut self) -> Result<(), JobError> {
+        let nodes = &self.shared.nodes;
+        let key = format!("film/{}-s{:08}", self.session, self.ledger.commits());
+        let film = journal::store_film(nodes, &self.film, &key)?;
+        let record = self.ledger.record_of(self.ledger.snapshot(film.clone()));
+        let [old, new] = std::mem::take(&mut self.superfluous);
+        let [old_records, new_records] = std::mem::take(&mut self.old_records);
+        let name = self.write(&record)?;
+        self.ledger.follow_snapshot(&record, name)?;
+        nodes.delete(&old)?;
+        nodes.wait(nodes.store().delete(&old_records))?;
+        self.superfluous = [new, film.into_iter().map(|f| (f.key, f.holders)).collect()];
+        self.old_records[0] = new_records;
+        Ok(())
+    }
+}

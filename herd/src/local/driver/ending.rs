@@ -1,0 +1,75 @@
+//! What is told while the job runs and at its end.
+
+use super::{Driver, image};
+use crate::job::{JobError, Status};
+use crate::local::{JobOutcome, usage};
+use crate::report::Report;
+
+impl Driver<'_, '_> {
+    pub(super) fn tell(&self) {
+        let [w, h] = self.shared.frame.size;
+        let pixels = u64::from(w) * u64::from(h);
+        let rays = self.ledger.rays();
+        self.progress.status(&Status {
+            elapsed: self.start.elapsed(),
+            rays,
+            samples: rays.camera,
+            samples_total: pixels * u64::from(self.sampling.spp),
+            waiting: self.ledger.waiting().map(|g| u64::from(g.rays)).sum(),
+            rounds: if self.shared.settings.has_barrier() { self.rounds } else { self.ledger.commits() },
+            error: self.error,
+        });
+    }
+
+    pub(super) fn finish(mut self) -> Result<JobOutcome, JobError> {
+        if self.owner.is_some() {
+            self.write_snapshot()?;
+        }
+        if let Some(owner) = &self.owner {
+            let nodes = &self.shared.nodes;
+            nodes.wait(owner.give_back(nodes.store().as_ref()))?;
+        }
+        let spp = self.ledger.done().complete();
+        let [width, height] = self.shared.frame.size;
+        let settings = self.shared.settings;
+        let counts = &self.shared.scene.manifest.counts;
+        let rel_mse = self.film.rel_mse(spp);
+        let (bytes, nodes_detail) = self.shared.nodes.report();
+        let skipped = [
+            ("degenerate", counts.degenerate),
+            ("non_finite", counts.non_finite),
+            ("out_of_range", counts.out_of_range),
+        ];
+        let mut report = Report {
+            strategy: settings.strategy.name().to_owned(),
+            nodes: settings.nodes.len() as u32,
+            slots: settings.slots(),
+            rounds: if settings.has_barrier() { self.rounds } else { self.tasks },
+            tasks: self.tasks,
+            tasks_redone: self.redone,
+            tasks_reused: self.reused,
+            attempts_lost: self.ledger.attempts_lost(),
+            wall_s: self.start.elapsed().as_secs_f64(),
+            cpu_s: usage::process_cpu(),
+            spp,
+            samples: u64::from(width) * u64::from(height) * u64::from(spp),
+            rays: self.ledger.rays(),
+            scene_bytes: self.shared.scene.manifest.scene_bytes(),
+            hops: self.hops,
+            bytes_per_hop: (self.hops > 0).then(|| self.hop_bytes as f64 / self.hops as f64),
+            peak_memory_bytes: usage::peak_memory(),
+            non_finite: self.film.rejected().count,
+            rel_mse,
+            target_reached: self.sampling.target_error.map(|t| rel_mse.is_some_and(|e| e <= t)),
+            nodes_detail,
+            skipped: skipped.into_iter().map(|(k, v)| (k.to_owned(), v)).collect(),
+            ..Report::default()
+        };
+        report.set_bytes(&bytes);
+        for (pixel, sample) in &self.film.rejected().keys {
+            let (x, y) = (pixel % width, pixel / width);
+            tracing::warn!("pixel {x},{y} sample {sample}: a contribution is not finite or too large");
+        }
+        Ok(JobOutcome { image: image(&self.film, spp), film: self.film, spp, report })
+    }
+}

@@ -1,0 +1,91 @@
+//! What the planner sees, and what is remembered of its plan.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use super::Driver;
+use crate::job::NodeSpec;
+use crate::ledger::{Destination, GroupRef};
+use crate::plan::{self, Assignment, NodeView, SplitView, View, Waiting};
+
+/// Largest forest that a task may hold (see `rayherd_render::bvh::Forest`), less room for its top tree.
+const FOREST_BYTES: u64 = (8 << 30) - (64 << 20);
+
+impl Driver<'_, '_> {
+    /// What to start now, with the keys of the groups that each takes.
+    pub(super) fn plan(&mut self) -> Vec<(Assignment, Vec<String>)> {
+        let settings = self.shared.settings;
+        let holders = self.shared.nodes.holders();
+        let split =
+            |&s: &u32| SplitView { bytes: self.shared.scene.split_bytes(s), holders: holders[s as usize].clone() };
+        let splits: Vec<SplitView> = self.order.iter().map(split).collect();
+        let groups: Vec<&GroupRef> = self.ledger.waiting().collect();
+        let mut waiting: BTreeMap<u32, Vec<Waiting>> = BTreeMap::new();
+        let mut reduce = Vec::new();
+        for (id, group) in groups.iter().enumerate() {
+            let entry = Waiting { id, rays: u64::from(group.rays) };
+            match group.to {
+                Destination::Split(s) => waiting.entry(self.rank[s as usize]).or_default().push(entry),
+                Destination::Reduce(_) => reduce.push(entry),
+            }
+        }
+        let mut view = View {
+            strategy: settings.strategy,
+            splits: &splits,
+            nodes: &self.nodes_as_seen(),
+            waiting,
+            reduce,
+            camera: self.cameras.rays(),
+            task_rays: self.rate.rays(settings.task_seconds),
+            task_camera: self.rate.camera(settings.task_seconds),
+            least_rays: u64::from(settings.batch),
+            replicas: settings.replicas,
+            forest: FOREST_BYTES,
+            cut: self.cut.as_deref().unwrap_or_default(),
+            traffic: self.traffic,
+        };
+        // a new cut is worth a thought when nothing is under way that was made for the old one
+        let (mut cut, nodes) = (None, view.nodes.iter().map(|n| NodeView { warm: BTreeSet::new(), ..n.clone() }));
+        let nodes: Vec<NodeView> = nodes.collect();
+        if settings.strategy == plan::Strategy::Auto
+            && (self.cut.is_none() || (self.live.is_empty() && groups.is_empty()))
+        {
+            cut = Some(plan::cut::choose(&view)).filter(|c| Some(c) != self.cut.as_ref());
+        }
+        if let Some(cut) = &cut {
+            (view.cut, view.nodes) = (cut, &nodes);
+        }
+        let plan = plan::plan(&view);
+        let keys = |a: &Assignment| a.groups.iter().map(|&g| groups[g].key.clone()).collect();
+        let plan = plan.into_iter().map(|a| (keys(&a), a)).map(|(keys, a)| (a, keys)).collect();
+        if cut.is_some() {
+            self.windows.iter_mut().for_each(BTreeSet::clear);
+            self.cut = cut;
+        }
+        plan
+    }
+
+    /// The nodes as the planner sees them.
+    pub(super) fn nodes_as_seen(&self) -> Vec<NodeView> {
+        let settings = self.shared.settings;
+        let node = |(n, spec): (usize, &NodeSpec)| {
+            let memory = self.shared.nodes.memory(n as u32);
+            let warm = if settings.strategy == plan::Strategy::Auto {
+                self.windows[n].clone()
+            } else {
+                memory.warm().into_iter().map(|s| self.rank[s as usize]).collect()
+            };
+            NodeView { slots: spec.slots, free: self.free[n], memory: memory.capacity(), warm }
+        };
+        settings.nodes.iter().enumerate().map(node).collect()
+    }
+
+    /// Remembers the window that a node of `auto` is to hold: beside what it holds if there is room, else instead of it.
+    pub(super) fn hold(&mut self, node: u32, ranks: &[u32]) {
+        let scene = self.shared.scene;
+        let held = &mut self.windows[node as usize];
+        let both: BTreeSet<u32> = held.iter().chain(ranks).copied().collect();
+        let bytes: u64 = both.iter().map(|&r| scene.split_bytes(self.order[r as usize])).sum();
+        let beside = bytes <= self.shared.nodes.memory(node).capacity() && !self.cut.as_ref().is_none_or(Vec::is_empty);
+        *held = if beside { both } else { ranks.iter().copied().collect() };
+    }
+}

@@ -1,0 +1,127 @@
+//! Objects in memory up to a budget, then in a temporary folder: what a job without a store keeps while it runs.
+
+use std::sync::{Mutex, PoisonError};
+
+use async_trait::async_trait;
+use bytes::Bytes;
+use tempfile::TempDir;
+
+use super::{BlockStore, DirectoryStore, MemoryStore, StoreError};
+
+/// Objects that vanish with this value. The folder is made when the first object does not fit into memory.
+pub struct Spilling {
+    memory: MemoryStore,
+    folder: Mutex<Option<(TempDir, DirectoryStore)>>,
+}
+
+impl Spilling {
+    /// Up to `budget` bytes of bodies stay in memory.
+    pub fn new(budget: u64) -> Self {
+        Spilling { memory: MemoryStore::with_limit(budget), folder: Mutex::default() }
+    }
+
+    fn folder(&self) -> Option<DirectoryStore> {
+        self.folder.lock().unwrap_or_else(PoisonError::into_inner).as_ref().map(|f| f.1.clone())
+    }
+
+    fn folder_or_new(&self) -> Result<DirectoryStore, StoreError> {
+        let mut folder = self.folder.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some((_, store)) = folder.as_ref() {
+            return Ok(store.clone());
+        }
+        let made = temporary_folder("rayherd-rays-")?;
+        let store = DirectoryStore::open_unsynced(made.path())?;
+        *folder = Some((made, store.clone()));
+        Ok(store)
+    }
+}
+
+/// A folder in the system's place for such (`TMPDIR`) that goes with the value.
+pub fn temporary_folder(prefix: &str) -> Result<TempDir, StoreError> {
+    tempfile::Builder::new().prefix(prefix).tempdir().map_err(|e| StoreError::Misconfigured {
+        store: std::env::temp_dir().display().to_string(),
+        message: format!("cannot make a temporary folder: {e}; set TMPDIR to a folder with room"),
+    })
+}
+
+#[async_trait]
+impl BlockStore for Spilling {
+    async fn put(&self, key: &str, body: Bytes) -> Result<(), StoreError> {
+        match self.memory.put(key, body.clone()).await {
+            Ok(()) => match self.folder() {
+                // an older body of the key may lie there
+                Some(folder) => folder.delete(&[key.to_owned()]).await,
+                None => Ok(()),
+            },
+            Err(StoreError::Full { .. }) => {
+                self.folder_or_new()?.put(key, body).await?;
+                self.memory.delete(&[key.to_owned()]).await
+            }
+            Err(e) => Err(e),
+        }
+    }
+
+    async fn get(&self, key: &str) -> Result<Bytes, StoreError> {
+        match (self.memory.get(key).await, self.folder()) {
+            (Err(StoreError::NotFound { .. }), Some(folder)) => folder.get(key).await,
+            (got, _) => got,
+        }
+    }
+
+    async fn size(&self, key: &str) -> Result<Option<u64>, StoreError> {
+        match (self.memory.size(key).await?, self.folder()) {
+            (None, Some(folder)) => folder.size(key).await,
+            (size, _) => Ok(size),
+        }
+    }
+
+    async fn list(&self, prefix: &str) -> Result<Vec<(String, u64)>, StoreError> {
+        let mut all = self.memory.list(prefix).await?;
+        if let Some(folder) = self.folder() {
+            all.extend(folder.list(prefix).await?);
+            all.sort();
+        }
+        Ok(all)
+    }
+
+    async fn delete(&self, keys: &[String]) -> Result<(), StoreError> {
+        self.memory.delete(keys).await?;
+        match self.folder() {
+            Some(folder) => folder.delete(keys).await,
+            None => Ok(()),
+        }
+    }
+
+    fn describe(&self) -> String {
+        "memory and a temporary folder".to_owned()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[tokio::test]
+    async fn conforms_with_and_without_room() {
+        for budget in [0, 100_000, u64::MAX] {
+            super::super::conformance::conformance(&Spilling::new(budget)).await;
+        }
+    }
+
+    #[tokio::test]
+    async fn what_memory_does_not_hold_is_in_a_folder_that_goes() {
+        let store = Spilling::new(10);
+        store.put("a", Bytes::from_static(b"12345678")).await.unwrap();
+        assert!(store.folder().is_none());
+        store.put("b", Bytes::from_static(b"123")).await.unwrap();
+        let root = store.folder().unwrap().root().to_path_buf();
+        assert!(root.join("b").is_file() && store.get("b").await.unwrap() == "123");
+        // a key has one body, wherever the one before was
+        store.put("a", Bytes::from_static(b"12345678901")).await.unwrap();
+        store.put("b", Bytes::from_static(b"4")).await.unwrap();
+        assert_eq!((store.get("a").await.unwrap(), store.get("b").await.unwrap()), ("12345678901".into(), "4".into()));
+        assert_eq!(store.list("").await.unwrap(), [("a".to_owned(), 11), ("b".to_owned(), 1)]);
+        drop(store);
+        assert!(!root.exists());
+    }
+}
