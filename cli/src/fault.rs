@@ -3,10 +3,9 @@
 use std::io;
 
 use rayherd_herd::job::JobError;
-use rayherd_herd::store::StoreError;
+use rayherd_herd::store::{StoreError, object_is_users};
 use rayherd_scene::ImportError;
 use rayherd_scene::manifest::ManifestError;
-use rayherd_scene::objects::ObjectError;
 use rayherd_scene::prepare::PrepareError;
 use rayherd_scene::tools::ToolError;
 
@@ -14,6 +13,11 @@ use rayherd_scene::tools::ToolError;
 #[derive(Debug, thiserror::Error)]
 #[error("{0}")]
 pub struct Mistake(pub String);
+
+/// Whether a signal ended it.
+pub fn is_interrupted(error: &anyhow::Error) -> bool {
+    error.chain().any(|cause| matches!(cause.downcast_ref(), Some(JobError::Cancelled)))
+}
 
 /// 2 when the user can put it right, 1 when it is ours or the machine's.
 pub fn exit_code(error: &anyhow::Error) -> u8 {
@@ -35,14 +39,7 @@ fn is_users(cause: &(dyn std::error::Error + 'static)) -> bool {
             PrepareError::Inconsistent(_) | PrepareError::Spool { .. } => false,
         })
         || cause.downcast_ref().is_some_and(JobError::is_users)
-        || cause.downcast_ref().is_some_and(|e| match e {
-            StoreError::Unavailable { .. } | StoreError::Full { .. } => false,
-            StoreError::NotFound { .. }
-            | StoreError::Denied { .. }
-            | StoreError::Corrupt { .. }
-            | StoreError::InvalidKey { .. }
-            | StoreError::Misconfigured { .. } => true,
-        })
+        || cause.downcast_ref().is_some_and(StoreError::is_users)
         || cause.downcast_ref().is_some_and(|e| match e {
             ToolError::Import(e) => import_is_users(e),
             ToolError::Write { source, .. } => is_wrong_path(source),
@@ -58,14 +55,6 @@ fn import_is_users(error: &ImportError) -> bool {
     match error {
         ImportError::Io { source, .. } => is_wrong_path(source),
         ImportError::Malformed { .. } | ImportError::Unsupported(_) | ImportError::Limit { .. } => true,
-    }
-}
-
-fn object_is_users(error: &ObjectError) -> bool {
-    match error {
-        // what is gone or broken is prepared again, as the message says
-        ObjectError::Missing { .. } | ObjectError::Corrupt { .. } | ObjectError::Name { .. } => true,
-        ObjectError::Failed { source, .. } => source.downcast_ref().is_some_and(is_wrong_path),
     }
 }
 

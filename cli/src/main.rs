@@ -4,6 +4,7 @@ mod commands;
 mod fault;
 mod frames;
 mod image_options;
+mod interrupt;
 mod job_file;
 mod log;
 mod options;
@@ -37,8 +38,13 @@ fn main() -> ExitCode {
     // prints help and mistakes by itself, and exits with 2 for a mistake
     let arguments = Arguments::parse();
     log::install();
+    interrupt::install();
     match std::panic::catch_unwind(|| commands::run(arguments.command)) {
         Ok(Ok(code)) => code,
+        Ok(Err(error)) if fault::is_interrupted(&error) => {
+            eprintln!("{}", fault::tell(&error));
+            interrupt::code().map_or(ExitCode::FAILURE, ExitCode::from)
+        }
         Ok(Err(error)) => {
             eprintln!("error: {}", fault::tell(&error));
             fault::exit_code(&error).into()

@@ -7,6 +7,7 @@ use std::time::{Duration, Instant};
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use rayherd_herd::job::{Image, Progress, Status};
 
+use crate::interrupt;
 use crate::log::bars;
 use crate::output::{png_file, replace};
 
@@ -68,6 +69,9 @@ fn console_is_terminal() -> bool {
 }
 
 impl Progress for Display {
+    fn is_cancelled(&self) -> bool {
+        interrupt::requested()
+    }
     fn status(&self, status: &Status) {
         let text = describe(status, self.pixels, self.target_error);
         if let Some(bar) = &self.bar {

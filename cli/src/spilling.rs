@@ -5,6 +5,8 @@ use std::sync::{Mutex, PoisonError};
 use rayherd_scene::objects::{DirectoryObjects, MemoryObjects, ObjectError, ObjectKind, ObjectRef, ObjectStore};
 use tempfile::TempDir;
 
+use crate::interrupt;
+
 /// Objects of a run, gone when it ends.
 pub struct SpillingObjects {
     memory: MemoryObjects,
@@ -45,6 +47,7 @@ impl SpillingObjects {
             action: "make a folder for the prepared scene (set TMPDIR, or pass --store)".into(),
             source: Box::new(source),
         })?;
+        interrupt::remove_at_end(folder.path());
         let store = DirectoryObjects::open(folder.path())?;
         state.folder = Some((folder, store.clone()));
         Ok(Some(store))

@@ -4,7 +4,7 @@ mod common;
 
 use std::fs;
 use std::path::Path;
-use std::process::{Command, Stdio};
+use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
 use common::{Run, assert_mistake, rayherd, repository};
@@ -71,6 +71,55 @@ fn more_samples_continue_and_equal_the_longer_run() {
     assert_mistake(&render(folder, "4", "a.exr", &["--store", "s3://x"]), &["s3://x"]);
 }
 
+/// Waits until the store holds some commits of the child, which must still run then.
+fn wait_for_commits(folder: &Path, child: &mut Child) {
+    let commits = || {
+        let jobs = fs::read_dir(folder.join("s/jobs")).ok().into_iter().flatten().flatten();
+        jobs.map(|job| count(&job.path().join("records"))).sum::<usize>()
+    };
+    let begun = Instant::now();
+    while commits() < 3 && begun.elapsed() < Duration::from_secs(60) && child.try_wait().unwrap().is_none() {
+        std::thread::sleep(Duration::from_millis(2));
+    }
+    assert!(child.try_wait().unwrap().is_none(), "it was done before it could be stopped");
+}
+
+#[test]
+fn a_signal_ends_a_run_between_commits_and_leaves_no_temporary_folder() {
+    let folder = tempfile::tempdir().unwrap();
+    let folder = folder.path();
+    let temporary = folder.join("tmp");
+    fs::create_dir(&temporary).unwrap();
+    let options = ["--store", "s", "--resume", "--task-seconds", "0.02", "--threads", "1", "--nodes", "2"];
+    let scene = scene();
+    for (signal, code) in [("-INT", 130), ("-TERM", 143)] {
+        let mut child = Command::new(env!("CARGO_BIN_EXE_rayherd"))
+            .args(arguments(&scene, "400", "x.exr", &options))
+            .current_dir(folder)
+            .env("TMPDIR", &temporary)
+            .stdout(Stdio::null())
+            .stderr(Stdio::null())
+            .spawn()
+            .unwrap();
+        wait_for_commits(folder, &mut child);
+        let folders = || fs::read_dir(&temporary).unwrap().count();
+        let begun = Instant::now();
+        while folders() == 0 && begun.elapsed() < Duration::from_secs(60) {
+            std::thread::sleep(Duration::from_millis(2));
+        }
+        assert!(folders() > 0, "nodes have folders");
+        assert!(Command::new("kill").args([signal, &child.id().to_string()]).status().unwrap().success());
+        assert_eq!(child.wait().unwrap().code(), Some(code));
+        assert_eq!(folders(), 0);
+    }
+    let resumed = render(folder, "400", "x.exr", &["--store", "s", "--resume", "--report", "r.json"]);
+    assert_eq!(resumed.code, 0, "{}", resumed.err);
+    let report: Value = serde_json::from_slice(&bytes(folder, "r.json")).unwrap();
+    assert!(report["tasks_reused"].as_u64() >= Some(3), "{report}");
+    assert_eq!(render(folder, "400", "whole.exr", &[]).code, 0);
+    assert!(bytes(folder, "x.exr") == bytes(folder, "whole.exr"));
+}
+
 #[test]
 fn a_killed_run_goes_on_and_a_live_one_is_refused() {
     let folder = tempfile::tempdir().unwrap();
@@ -85,20 +134,7 @@ fn a_killed_run_goes_on_and_a_live_one_is_refused() {
         .stderr(Stdio::null())
         .spawn()
         .unwrap();
-    let commits = || {
-        fs::read_dir(folder.join("s/jobs"))
-            .ok()
-            .into_iter()
-            .flatten()
-            .flatten()
-            .map(|job| count(&job.path().join("records")))
-            .sum::<usize>()
-    };
-    let begun = Instant::now();
-    while commits() < 3 && begun.elapsed() < Duration::from_secs(60) && child.try_wait().unwrap().is_none() {
-        std::thread::sleep(Duration::from_millis(2));
-    }
-    assert!(child.try_wait().unwrap().is_none(), "it was done before it could be killed");
+    wait_for_commits(folder, &mut child);
     let refused = render(folder, "200", "x.exr", &["--store", "s", "--resume"]);
     assert_eq!(refused.code, 2, "{}", refused.err);
     assert!(child.try_wait().unwrap().is_none(), "it was done before the second could be refused");

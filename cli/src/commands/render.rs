@@ -18,6 +18,7 @@ use serde_json::json;
 use super::print;
 use crate::frames::{self, Shot};
 use crate::image_options::ImageOptions;
+use crate::interrupt::{self, Heeding};
 use crate::job_file::read_job;
 use crate::options::{self, CutOptions, SceneOptions, set};
 use crate::output::{exr_file, png_file, replace};
@@ -203,9 +204,17 @@ fn render(
 ) -> anyhow::Result<JobOutcome> {
     let [width, height] = shot.frame.size;
     let display = Display::new(u64::from(width) * u64::from(height), sampling.target_error, Some(preview));
+    let heeding = Heeding::begin();
     let outcome = render_local(scene, &shot.frame, sampling, settings, &display);
+    drop(heeding);
     display.finish();
-    outcome.with_context(|| format!("cannot render {}", shot.exr.display()))
+    outcome.with_context(|| match (interrupt::requested(), &settings.commits) {
+        (true, Some(_)) => {
+            format!("{} is not finished: its committed samples are kept, go on with --resume", shot.exr.display())
+        }
+        (true, None) => format!("{} is not finished; with --store it could be resumed", shot.exr.display()),
+        (false, _) => format!("cannot render {}", shot.exr.display()),
+    })
 }
 
 fn save(scene: &PreparedScene, shot: &Shot, outcome: &JobOutcome, exposure: f64) -> anyhow::Result<()> {
