@@ -58,7 +58,8 @@ fn write_summary(m: &Manifest, out: &mut String) -> std::fmt::Result {
 
     let g = &m.grid;
     let choice = &m.choice;
-    let cells = u64::from(g.subdiv).pow(3);
+    let stride = g.lattice().map_or(g.subdiv, |l| l.stride());
+    let cells = u64::from(stride).pow(3);
     let why = match choice.stopped_by {
         StoppedBy::Threshold => format!("share of contested primitives at most {}", m.settings.overlap_threshold),
         StoppedBy::Several => format!("at least {} occupied cells per split", m.settings.several),
@@ -66,9 +67,10 @@ fn write_summary(m: &Manifest, out: &mut String) -> std::fmt::Result {
     };
     writeln!(
         out,
-        "grid         {0} x {0} x {0}, {1} of {cells} cells occupied; stopped by: {why}",
+        "grid         {0} x {0} x {0}{2}, {1} of {cells} cells occupied; stopped by: {why}",
         g.subdiv,
-        g.cells.len()
+        g.cells.len(),
+        if stride > g.subdiv { " and a layer around" } else { "" }
     )?;
     let fullest = g.cells.iter().map(|c| c.primitives).max().unwrap_or(0);
     writeln!(out, "fullest cell {fullest} primitives; a split holds {}", choice.capacity)?;
@@ -83,8 +85,9 @@ fn write_summary(m: &Manifest, out: &mut String) -> std::fmt::Result {
     if m.settings.overlap_reduction {
         writeln!(
             out,
-            "duplicates   {} primitives in copied splits, {} written again ({:.1} % of the scene)",
+            "duplicates   {} primitives of {} cells in copied splits, {} written again ({:.1} % of the scene)",
             choice.copies,
+            choice.copied_cells,
             size(choice.rewritten_bytes),
             100.0 * choice.rewritten_bytes as f64 / m.scene_bytes().max(1) as f64
         )?;
@@ -142,7 +145,8 @@ const CONTESTED: [u8; 3] = [255, 255, 255];
 /// The grid as slices along z, from the lowest at the top left, row by row. In a slice x goes right and y up. A cell has the
 /// colour of its owner; one with several owners shows two of them in a checkerboard with a white rim.
 pub fn picture(manifest: &Manifest) -> Picture {
-    let n = manifest.grid.subdiv;
+    // a manifest that was checked has a lattice
+    let n = manifest.grid.lattice().map_or(manifest.grid.subdiv, |l| l.stride());
     // one row or column of background around each slice, some 1024 pixels in all, 2 to 24 a cell
     let columns = (1..=n).find(|c| c * c >= n).unwrap_or(1);
     let rows = n.div_ceil(columns);

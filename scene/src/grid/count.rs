@@ -61,14 +61,17 @@ pub(crate) type Box3 = [[f32; 3]; 2];
 /// Triangles that are looked at together first: neighbours in the file are often neighbours in space.
 pub(crate) const RUN: usize = 16;
 
-/// A box as fractions of the scene's, in units of 2^-32, rounded outwards by so much that a plane of any candidate that
-/// touches the box lies strictly between its corners, or at one of them.
+/// A box as fractions of the grid's inner one, in units of 2^-32, rounded outwards by so much that a plane of any candidate
+/// that touches the box lies strictly between its corners, or at one of them. [`OUT`] for one that reaches out of it.
 type Place = [[u32; 3]; 2];
 
+/// Inside out: the box of nothing.
+const OUT: Place = [[u32::MAX; 3], [0; 3]];
+
 impl<'a> Primitives<'a> {
-    /// From vertices, and centres and radii; `lattice` has the scene's box (its subdivision does not matter).
+    /// From vertices, and centres and radii; `lattice` has the boxes (its subdivision does not matter).
     pub fn new(lattice: &Lattice, triangles: &'a [[[f32; 3]; 3]], spheres: Vec<([f32; 3], f32)>) -> Self {
-        let (lo, hi) = lattice.bounds();
+        let (lo, hi) = lattice.inner();
         let units = (1u64 << 32) as f64;
         let scale: [f64; 3] = std::array::from_fn(|a| if hi[a] > lo[a] { units / (hi[a] - lo[a]) } else { 0.0 });
         // a coordinate's fraction is rounded by 4 u, a plane by 3 u M in position: in units of 2^-32 of the box, below
@@ -76,7 +79,10 @@ impl<'a> Primitives<'a> {
         let m = lattice.magnitude();
         let margin: [f64; 3] = std::array::from_fn(|a| 2.0 + (m * scale[a] * 1e-15).ceil());
         let place = |[low, high]: Box3| -> Place {
-            // casts saturate: what is outside stays at the box's faces
+            if lattice.reaches_out(&low, &high) {
+                return OUT;
+            }
+            // casts saturate: what is outside by the margin stays at the box's faces
             let from = |x: f32, a: usize| (f64::from(x) - lo[a]) * scale[a];
             [
                 std::array::from_fn(|a| (from(low[a], a) - margin[a]) as u32),
@@ -95,10 +101,14 @@ impl<'a> Primitives<'a> {
 /// The cell of a lattice that a box lies in for certain, if there is one: an integer product for each face instead of
 /// a division, and no plane is computed.
 #[inline]
-fn certain_cell(subdiv: u32, [low, high]: &Place) -> Option<[u32; 3]> {
+fn certain_cell(lattice: &Lattice, [low, high]: &Place) -> Option<[u32; 3]> {
+    if low[0] > high[0] {
+        return None;
+    }
+    let subdiv = lattice.subdiv();
     let cell = |q: u32| ((u64::from(q) * u64::from(subdiv)) >> 32) as u32;
     let at = low.map(cell);
-    (at == high.map(cell)).then_some(at)
+    (at == high.map(cell)).then(|| lattice.from_inner(at))
 }
 
 /// Box of points.
@@ -149,6 +159,19 @@ pub struct Counter {
     cells: Vec<CellCount>,
 }
 
+/// An occupied cell.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Occupied {
+    /// Its lattice index.
+    pub index: u32,
+    /// Primitives that overlap it.
+    pub primitives: u32,
+    /// Number of splits that hold them.
+    pub owners: u32,
+    /// The last of those splits.
+    pub last_owner: u32,
+}
+
 #[derive(Clone, Copy, Debug)]
 struct CellCount {
     primitives: u32,
@@ -183,15 +206,14 @@ impl Counter {
                 cell.owners += 1;
             }
         };
-        let n = lattice.subdiv();
         let runs = primitives.triangles.chunks(RUN).zip(primitives.places.chunks(RUN)).zip(&primitives.runs);
         for ((run, places), together) in runs {
-            if let Some(at) = certain_cell(n, together) {
+            if let Some(at) = certain_cell(lattice, together) {
                 touch(at, run.len() as u32);
                 continue;
             }
             for (p, place) in run.iter().zip(places) {
-                match certain_cell(n, place) {
+                match certain_cell(lattice, place) {
                     Some(at) => touch(at, 1),
                     None => triangle_cells(lattice, &p.map(|v| v.map(f64::from)), &mut |at| touch(at, 1)),
                 }
@@ -218,9 +240,14 @@ impl Counter {
         sum
     }
 
-    /// Occupied cells by ascending index: index, primitives, number of owners.
-    pub fn occupied(&self) -> impl Iterator<Item = (u32, u32, u32)> + '_ {
-        (0..).zip(&self.cells).filter(|(_, c)| c.primitives > 0).map(|(i, c)| (i, c.primitives, c.owners))
+    /// Occupied cells by ascending index.
+    pub fn occupied(&self) -> impl Iterator<Item = Occupied> + '_ {
+        (0..).zip(&self.cells).filter(|(_, c)| c.primitives > 0).map(|(index, c)| Occupied {
+            index,
+            primitives: c.primitives,
+            owners: c.owners,
+            last_owner: c.last,
+        })
     }
 }
 
@@ -313,9 +340,8 @@ mod tests {
         counter.add(1, &Primitives::new(&counter.lattice().clone(), &second, spheres));
         let third = [small(1.3)];
         counter.add(1, &Primitives::new(&counter.lattice().clone(), &third, vec![]));
-        let mut occupied: Vec<_> = counter.occupied().collect();
-        occupied.sort();
-        assert_eq!(occupied, [(0, 5, 2), (1, 2, 2)]);
+        let occupied: Vec<_> = counter.occupied().map(|c| (c.index, c.primitives, c.owners, c.last_owner)).collect();
+        assert_eq!(occupied, [(0, 5, 2, 1), (1, 2, 2, 1)]);
         let sum = counter.summary();
         assert_eq!((sum.occupied, sum.fullest, sum.pairs, sum.contested_pairs), (2, 5, 7, 7));
     }
@@ -345,16 +371,21 @@ mod tests {
                 triangles.iter().map(|p| p.map(|v| [v[0], v[1], v[2] * squeeze + shift])).collect();
             let [lo, hi] = box_of(moved.as_flattened());
             for subdiv in [1, 2, 5, 8, 16, 100] {
-                let lattice = Lattice::new(subdiv, lo, hi).unwrap();
-                let mut fast = Counter::new(lattice.clone());
-                fast.add(7, &Primitives::new(&lattice, &moved, vec![]));
-                let mut plain = vec![0u32; lattice.len()];
-                for p in &moved {
-                    let p = p.map(|v| v.map(f64::from));
-                    triangle_cells(&lattice, &p, &mut |at| plain[lattice.index(at) as usize] += 1);
+                let part = |a: usize, t: f32| lo[a] + t * (hi[a] - lo[a]);
+                let inner = |from: f32, to: f32| [from, to].map(|t| std::array::from_fn(|a| part(a, t).min(hi[a])));
+                // the last is flat, on a plane that many corners lie in
+                for inner in [[lo, hi], inner(0.25, 0.75), inner(0.0, 0.5), inner(0.5, 1.0), inner(0.5, 0.5)] {
+                    let lattice = Lattice::around(subdiv, inner, lo, hi).unwrap();
+                    let mut fast = Counter::new(lattice.clone());
+                    fast.add(7, &Primitives::new(&lattice, &moved, vec![]));
+                    let mut plain = vec![0u32; lattice.len()];
+                    for p in &moved {
+                        let p = p.map(|v| v.map(f64::from));
+                        triangle_cells(&lattice, &p, &mut |at| plain[lattice.index(at) as usize] += 1);
+                    }
+                    let counted: Vec<u32> = fast.cells.iter().map(|c| c.primitives).collect();
+                    assert_eq!(counted, plain, "{subdiv}");
                 }
-                let counted: Vec<u32> = fast.cells.iter().map(|c| c.primitives).collect();
-                assert_eq!(counted, plain, "{subdiv}");
             }
         }
     }

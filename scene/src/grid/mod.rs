@@ -1,6 +1,6 @@
 //! The scheduling grid: which split owns which part of space.
 //!
-//! `subdiv`^3 cells over the scene's box. A primitive belongs to every cell that it overlaps; an occupied cell knows
+//! `subdiv`^3 cells over the box of what does not emit light, and a layer of cells around them where lamps lie outside. A primitive belongs to every cell that it overlaps; an occupied cell knows
 //! the splits that hold its primitives (its *owners*) and the tight box of what is inside it. A ray that may still
 //! hit something outside the resident splits finds out here where to go ([`Grid::next_foreign`]).
 
@@ -23,8 +23,12 @@ pub use walk::{Foreign, Progress};
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct GridData {
-    /// Cells along each axis, 1 to [`MAX_SUBDIV`].
+    /// Cells along each axis of the inner box, 1 to [`MAX_SUBDIV`].
     pub subdiv: u32,
+    /// Lower corner of the inner box, recentred: that of what does not emit light.
+    pub inner_lo: [f32; 3],
+    /// Upper corner of the inner box, recentred; it lies just outside where something lies above it.
+    pub inner_hi: [f32; 3],
     /// Lower corner of the scene's box, recentred.
     pub lo: [f32; 3],
     /// Upper corner of the scene's box, recentred.
@@ -33,11 +37,18 @@ pub struct GridData {
     pub cells: Vec<CellData>,
 }
 
+impl GridData {
+    /// Its cells' geometry; the message says what is wrong with its boxes or its subdivision.
+    pub fn lattice(&self) -> Result<Lattice, String> {
+        Lattice::around(self.subdiv, [self.inner_lo, self.inner_hi], self.lo, self.hi)
+    }
+}
+
 /// One occupied cell.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct CellData {
-    /// `x + subdiv * (y + subdiv * z)`.
+    /// `x + n (y + n z)`, `n` being the [`Lattice::stride`].
     pub index: u32,
     /// Lower corner of the box that holds every point of its primitives in the cell.
     pub lo: [f32; 3],
@@ -81,7 +92,7 @@ impl Grid {
     /// Checks a grid over `splits` splits and makes it ready. Never panics, whatever the data.
     pub fn new(data: &GridData, splits: u32) -> Result<Grid, GridError> {
         let refuse = |message: String| Err(GridError(message));
-        let lattice = Lattice::new(data.subdiv, data.lo, data.hi).map_err(GridError)?;
+        let lattice = data.lattice().map_err(GridError)?;
         if data.cells.is_empty() {
             return refuse("no cell is occupied".to_owned());
         }

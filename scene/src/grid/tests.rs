@@ -5,7 +5,7 @@ use super::lattice::{round_down, round_up};
 use super::*;
 
 /// A grid from a seed: random occupancy, tight boxes and owners.
-fn random_grid(seed: u64, subdiv: u32, splits: u32, fill: f64, lo: [f32; 3], hi: [f32; 3]) -> Option<Grid> {
+fn random_grid(seed: u64, subdiv: u32, splits: u32, fill: f64, (inner, lo, hi): Boxes) -> Option<Grid> {
     let mut state = seed;
     let mut next = move || {
         // SplitMix64
@@ -15,7 +15,7 @@ fn random_grid(seed: u64, subdiv: u32, splits: u32, fill: f64, lo: [f32; 3], hi:
         z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
         ((z ^ (z >> 31)) >> 11) as f64 / (1u64 << 53) as f64
     };
-    let lattice = Lattice::new(subdiv, lo, hi).unwrap();
+    let lattice = Lattice::around(subdiv, inner, lo, hi).unwrap();
     let mut cells = Vec::new();
     for index in 0..lattice.len() as u32 {
         let Some(at) = lattice.coordinates(index) else { continue };
@@ -43,7 +43,8 @@ fn random_grid(seed: u64, subdiv: u32, splits: u32, fill: f64, lo: [f32; 3], hi:
         cell.owners = owners;
         cells.push(cell);
     }
-    (!cells.is_empty()).then(|| Grid::new(&GridData { subdiv, lo, hi, cells }, splits).unwrap())
+    let [inner_lo, inner_hi] = inner;
+    (!cells.is_empty()).then(|| Grid::new(&GridData { subdiv, inner_lo, inner_hi, lo, hi, cells }, splits).unwrap())
 }
 
 fn sequence(grid: &Grid, ray: &Ray, resident: &SplitSet, naive: bool) -> Vec<(u32, f64)> {
@@ -105,12 +106,21 @@ fn ray() -> impl Strategy<Value = Ray> {
     })
 }
 
-fn boxes() -> impl Strategy<Value = ([f32; 3], [f32; 3])> {
+/// Inner box, lower and upper corner.
+type Boxes = ([[f32; 3]; 2], [f32; 3], [f32; 3]);
+
+fn boxes() -> impl Strategy<Value = Boxes> {
+    let plain = |lo: [f32; 3], hi: [f32; 3]| Just(([lo, hi], lo, hi));
     prop_oneof![
-        Just(([-2.0f32; 3], [2.0f32; 3])),
-        Just(([-2.0, -1.0, 0.5], [2.0, -1.0, 0.75])),
-        Just(([-1.0, -1e-6, -2.0], [1.0, 1e-6, 2.0])),
-        Just(([0.1; 3], [0.1; 3])),
+        2 => plain([-2.0f32; 3], [2.0f32; 3]),
+        1 => plain([-2.0, -1.0, 0.5], [2.0, -1.0, 0.75]),
+        1 => plain([-1.0, -1e-6, -2.0], [1.0, 1e-6, 2.0]),
+        1 => plain([0.1; 3], [0.1; 3]),
+        // layers around, on one side, around a flat box, around a point
+        2 => Just(([[-1.0, -0.5, 0.25], [1.0, 0.5, 1.5]], [-3.0; 3], [3.0; 3])),
+        1 => Just(([[-2.0, -2.0, -2.0], [2.0, 0.5, 2.0]], [-2.0; 3], [2.0, 2.75, 2.0])),
+        1 => Just(([[-1.0, 0.0, -1.0], [1.0, 0.0f32.next_up(), 1.0]], [-1.0, -0.5, -1.0], [1.0, 2.0, 1.0])),
+        1 => Just(([[0.5; 3], [0.5; 3]], [-1.0, -1.0, 0.5], [1.0, 0.5, 2.0])),
     ]
 }
 
@@ -119,15 +129,15 @@ proptest! {
 
     #[test]
     fn the_walk_is_its_naive_twin_and_holds_every_exact_cell(
-        seed: u64, subdiv in 1u32..12, (lo, hi) in boxes(), fill in 0.05f64..1.0, ray in ray(), inside: u32,
+        seed: u64, subdiv in 1u32..12, boxes in boxes(), fill in 0.05f64..1.0, ray in ray(), inside: u32,
     ) {
         let splits = 5;
-        let Some(grid) = random_grid(seed, subdiv, splits, fill, lo, hi) else { return Ok(()) };
+        let Some(grid) = random_grid(seed, subdiv, splits, fill, boxes) else { return Ok(()) };
         let resident: SplitSet = (0..splits).filter(|s| inside >> s & 1 == 1).collect();
         let walk = sequence(&grid, &ray, &resident, false);
         prop_assert_eq!(&walk, &sequence(&grid, &ray, &resident, true));
         prop_assert!(walk.windows(2).all(|w| (w[0].1, w[0].0) < (w[1].1, w[1].0)));
-        let reach = ray.o.iter().fold(2.0f64, |m, x| m.max(f64::from(x.abs())));
+        let reach = ray.o.iter().fold(3.0f64, |m, x| m.max(f64::from(x.abs())));
         for cell in 0..grid.occupied() {
             let (lo, hi) = grid.bounds(cell).unwrap();
             let foreign = grid.owners(cell).iter().any(|&s| !resident.contains(s));
@@ -149,8 +159,10 @@ proptest! {
     }
 
     #[test]
-    fn numbers_and_planes_agree(subdiv in 1u32..=256, x in -3.0f64..3.0, (lo, hi) in boxes(), axis in 0usize..3) {
-        let lattice = Lattice::new(subdiv, lo, hi).unwrap();
+    fn numbers_and_planes_agree(subdiv in 1u32..=256, x in -4.0f64..4.0, at_plane in 0u32..600, (inner, lo, hi) in boxes(), axis in 0usize..3) {
+        let lattice = Lattice::around(subdiv, inner, lo, hi).unwrap();
+        // half of the time a plane itself
+        let x = if at_plane < 300 { lattice.plane(axis, at_plane % (lattice.count(axis) + 1)) } else { x };
         let k = lattice.number(axis, x);
         prop_assert!(k < lattice.count(axis));
         let (l, h) = lattice.bounds();
@@ -158,6 +170,16 @@ proptest! {
             prop_assert!(lattice.plane(axis, k) <= x && x < lattice.plane(axis, k + 1));
         }
         prop_assert!(lattice.nearby(axis, x).abs_diff(k) <= 1);
+        let planes: Vec<f64> = (0..=lattice.count(axis)).map(|k| lattice.plane(axis, k)).collect();
+        prop_assert!(planes.windows(2).all(|w| w[0] <= w[1]) && planes[0] == l[axis] && planes.last() == Some(&h[axis]));
+        let y = x as f32;
+        let mut at = inner[0];
+        at[axis] = y;
+        if f64::from(y) >= l[axis] && f64::from(y) < h[axis] && (0..3).all(|a| inner[0][a] < inner[1][a]) {
+            let k = lattice.number(axis, f64::from(y));
+            let outside = lattice.plane(axis, k + 1) <= lattice.inner().0[axis] || lattice.plane(axis, k) >= lattice.inner().1[axis];
+            prop_assert_eq!(lattice.reaches_out(&at, &at), outside);
+        }
     }
 
     #[test]
@@ -172,7 +194,18 @@ proptest! {
 #[test]
 fn rays_that_are_none_end_quietly() {
     let cell = CellData { index: 0, lo: [-2.0; 3], hi: [2.0; 3], primitives: 1, owners: vec![0] };
-    let grid = Grid::new(&GridData { subdiv: 1, lo: [-2.0; 3], hi: [2.0; 3], cells: vec![cell] }, 1).unwrap();
+    let grid = Grid::new(
+        &GridData {
+            subdiv: 1,
+            inner_lo: [-2.0; 3],
+            inner_hi: [2.0; 3],
+            lo: [-2.0; 3],
+            hi: [2.0; 3],
+            cells: vec![cell],
+        },
+        1,
+    )
+    .unwrap();
     let none = SplitSet::default();
     let good = Ray { o: [0.0; 3], tmin: 0.0, d: [1.0, 0.0, 0.0], tmax: f32::INFINITY };
     assert!(grid.first_cell(&good).is_some());
@@ -195,6 +228,8 @@ fn rays_that_are_none_end_quietly() {
 fn bad_grids_are_refused() {
     let good = GridData {
         subdiv: 2,
+        inner_lo: [0.0; 3],
+        inner_hi: [2.0; 3],
         lo: [0.0; 3],
         hi: [2.0; 3],
         cells: vec![
@@ -210,6 +245,10 @@ fn bad_grids_are_refused() {
         |g| g.lo[0] = f32::NAN,
         |g| g.hi[0] = f32::INFINITY,
         |g| g.hi[0] = -1.0,
+        |g| g.inner_lo[0] = -1.0,
+        |g| g.inner_hi[0] = 2.5,
+        |g| g.inner_hi[0] = -1.0,
+        |g| g.inner_lo[0] = f32::NAN,
         |g| g.cells.clear(),
         |g| g.cells.swap(0, 1),
         |g| g.cells[1].index = 8,

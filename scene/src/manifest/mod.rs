@@ -16,7 +16,7 @@ use crate::prepare::PrepareSettings;
 
 /// Version of the manifest and of everything it names. A change of any layout, of recentring, of the order of records
 /// or of the grid's rules changes it; scenes of other versions are prepared again.
-pub const FORMAT: u32 = 1;
+pub const FORMAT: u32 = 2;
 
 /// A prepared scene. Its bytes are canonical ([`Manifest::encode`]); its name is their hash.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -89,6 +89,8 @@ pub struct GridChoice {
     pub capacity: u64,
     /// Contested cells before overlap reduction.
     pub contested_cells: u64,
+    /// Cells that were copied: contested ones and those that a split would have been left with.
+    pub copied_cells: u64,
     /// Primitives in at least one contested cell, each counted once, before overlap reduction.
     pub contested_primitives: u64,
     /// Primitives in copied splits, each counted once per split.

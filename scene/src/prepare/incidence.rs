@@ -2,7 +2,7 @@
 
 use super::records::Records;
 use crate::grid::Lattice;
-use crate::grid::count::{Box3, Counter, RUN, box_of};
+use crate::grid::count::{Box3, Counter, Occupied, RUN, box_of};
 use crate::grid::lattice::{round_down, round_up};
 use crate::grid::touch::{Bounds, sphere_cells, sphere_in_cell, triangle_cells, triangle_in_cell};
 
@@ -16,6 +16,8 @@ pub(crate) struct ChosenCells {
     pub primitives: Vec<u32>,
     /// Whether several splits claim the cell, by number.
     pub contested: Vec<bool>,
+    /// What was counted, by number.
+    pub counted: Vec<Occupied>,
     /// Number by lattice index; [`ABSENT`] where nothing is.
     numbers: Vec<u32>,
 }
@@ -32,12 +34,13 @@ impl ChosenCells {
             indices: Vec::new(),
             primitives: Vec::new(),
             contested: Vec::new(),
+            counted: counter.occupied().collect(),
         };
-        for (index, primitives, owners) in counter.occupied() {
-            cells.numbers[index as usize] = cells.indices.len() as u32;
-            cells.indices.push(index);
-            cells.primitives.push(primitives);
-            cells.contested.push(owners > 1);
+        for cell in &cells.counted {
+            cells.numbers[cell.index as usize] = cells.indices.len() as u32;
+            cells.indices.push(cell.index);
+            cells.primitives.push(cell.primitives);
+            cells.contested.push(cell.owners > 1);
         }
         cells
     }
@@ -86,16 +89,16 @@ impl CellBox {
 pub(crate) struct Incidence {
     /// Numbers of the cells that its primitives lie in, ascending, with the box of what of them is there.
     pub cells: Vec<(u32, CellBox)>,
-    /// (triangle, group of contested cells), ascending, each once.
+    /// (triangle, group of copied cells), ascending, each once.
     pub triangles: Vec<(u32, u32)>,
-    /// (sphere, group of contested cells), ascending, each once.
+    /// (sphere, group of copied cells), ascending, each once.
     pub spheres: Vec<(u32, u32)>,
     /// Primitives in at least one contested cell.
     pub contested: u64,
 }
 
-/// Finds the cells of a split's primitives. `groups` gives by cell number the group that a contested cell is copied
-/// with; it is empty when nothing is copied.
+/// Finds the cells of a split's primitives. `groups` gives by cell number the group that a cell is copied with
+/// ([`ABSENT`] if it stays); it is empty when nothing is copied.
 pub(crate) fn incidence(cells: &ChosenCells, groups: &[u32], records: &Records) -> Incidence {
     let mut boxes = vec![CellBox::EMPTY; cells.len()];
     let mut out = Incidence { cells: Vec::new(), triangles: Vec::new(), spheres: Vec::new(), contested: 0 };
@@ -109,9 +112,9 @@ pub(crate) fn incidence(cells: &ChosenCells, groups: &[u32], records: &Records) 
             // a run is copied as its triangles are
             if cells.contested[number] {
                 out.contested += run.len() as u64;
-                if let Some(&group) = groups.get(number) {
-                    out.triangles.extend((first..).take(run.len()).map(|i| (i, group)));
-                }
+            }
+            if let Some(&group) = groups.get(number).filter(|g| **g != ABSENT) {
+                out.triangles.extend((first..).take(run.len()).map(|i| (i, group)));
             }
             continue;
         }
@@ -153,9 +156,9 @@ pub(crate) fn incidence(cells: &ChosenCells, groups: &[u32], records: &Records) 
 fn copy(cells: &ChosenCells, groups: &[u32], touched: &[usize], primitive: u32, pairs: &mut Vec<(u32, u32)>) -> bool {
     let before = pairs.len();
     let mut contested = false;
-    for &number in touched.iter().filter(|&&n| cells.contested[n]) {
-        contested = true;
-        if let Some(&group) = groups.get(number) {
+    for &number in touched {
+        contested |= cells.contested[number];
+        if let Some(&group) = groups.get(number).filter(|g| **g != ABSENT) {
             pairs.push((primitive, group));
         }
     }

@@ -9,6 +9,7 @@ use super::records::{Extra, NORMALS, Records, SphereBits, UVS};
 use super::spool::Spool;
 use super::{PrepareError, SpoolSettings};
 use crate::description::Description;
+use crate::grid::count::{Box3, box_of};
 use crate::grid::lattice::{round_down, round_up};
 use crate::manifest::Counts;
 use crate::record::{Record, RecordSource, SphereRecord, TriangleRecord};
@@ -36,9 +37,24 @@ pub(crate) struct Ingested {
     pub counts: Counts,
     pub lo: [f32; 3],
     pub hi: [f32; 3],
+    /// Box of what does not emit light, inside out if there is nothing.
+    dark: Box3,
     pub emissive: Vec<EmissivePrimitive>,
     /// Of all records, whatever the chunks.
     pub hash: blake3::Hash,
+}
+
+impl Ingested {
+    /// The box that the grid's equal cells fill: that of what does not emit light, if there is anything. Lamps are few, and
+    /// may be far away. Its upper corner lies just outside where something is above, since a cell does not hold its
+    /// upper face.
+    pub fn inner(&self) -> Box3 {
+        let [lo, hi] = self.dark;
+        if (0..3).any(|a| lo[a] > hi[a]) {
+            return [self.lo, self.hi];
+        }
+        [lo, std::array::from_fn(|a| if hi[a] < self.hi[a] { hi[a].next_up() } else { hi[a] })]
+    }
 }
 
 /// Why a record is skipped.
@@ -107,6 +123,7 @@ pub(crate) fn ingest(
         counts: Counts::default(),
         lo: [f32::INFINITY; 3],
         hi: [f32::NEG_INFINITY; 3],
+        dark: [[f32::INFINITY; 3], [f32::NEG_INFINITY; 3]],
         emissive: Vec::new(),
         hashers: Default::default(),
     };
@@ -128,8 +145,8 @@ pub(crate) fn ingest(
     for part in &reader.hashers {
         hasher.update(part.finalize().as_bytes());
     }
-    let Reader { spool, counts, lo, hi, emissive, .. } = reader;
-    Ok(Ingested { spool, counts, lo, hi, emissive, hash: hasher.finalize() })
+    let Reader { spool, counts, lo, hi, dark, emissive, .. } = reader;
+    Ok(Ingested { spool, counts, lo, hi, dark, emissive, hash: hasher.finalize() })
 }
 
 struct Reader<'a> {
@@ -140,6 +157,7 @@ struct Reader<'a> {
     counts: Counts,
     lo: [f32; 3],
     hi: [f32; 3],
+    dark: Box3,
     emissive: Vec<EmissivePrimitive>,
     /// One for each array, so that the sum does not depend on where chunks end.
     hashers: [blake3::Hasher; 7],
@@ -167,12 +185,7 @@ impl Reader<'_> {
         if zero_area(&p) {
             return Err(Skip::Degenerate);
         }
-        for v in &p {
-            for a in 0..3 {
-                self.lo[a] = self.lo[a].min(v[a]);
-                self.hi[a] = self.hi[a].max(v[a]);
-            }
-        }
+        self.cover(t.shape, box_of(&p));
         self.chunk.triangle_ids.push(id);
         self.chunk.triangles.push(p);
         let mut has = 0;
@@ -196,10 +209,8 @@ impl Reader<'_> {
         if radius <= 0.0 {
             return Err(Skip::Degenerate);
         }
-        for a in 0..3 {
-            self.lo[a] = self.lo[a].min(round_down(f64::from(center[a]) - f64::from(radius)));
-            self.hi[a] = self.hi[a].max(round_up(f64::from(center[a]) + f64::from(radius)));
-        }
+        let end = |sign: f64| center.map(|c| f64::from(c) + sign * f64::from(radius));
+        self.cover(s.shape, [end(-1.0).map(round_down), end(1.0).map(round_up)]);
         self.chunk.sphere_ids.push(id);
         self.chunk.spheres.push(SphereBits { center, radius, shape: s.shape, flipped: u32::from(s.flipped) });
         self.counts.spheres += 1;
@@ -207,9 +218,26 @@ impl Reader<'_> {
         Ok(())
     }
 
-    fn emit(&mut self, prim: PrimId, shape: u32, geometry: Primitive) {
+    /// Adds a primitive's box to those of the scene.
+    fn cover(&mut self, shape: u32, [lo, hi]: Box3) {
+        let dark = !self.emits(shape);
+        for a in 0..3 {
+            self.lo[a] = self.lo[a].min(lo[a]);
+            self.hi[a] = self.hi[a].max(hi[a]);
+            if dark {
+                self.dark[0][a] = self.dark[0][a].min(lo[a]);
+                self.dark[1][a] = self.dark[1][a].max(hi[a]);
+            }
+        }
+    }
+
+    fn emits(&self, shape: u32) -> bool {
         let emission = self.description.shapes.get(shape as usize).and_then(|s| s.emission);
-        if emission.is_some_and(|e| e.iter().any(|&x| x > 0.0)) {
+        emission.is_some_and(|e| e.iter().any(|&x| x > 0.0))
+    }
+
+    fn emit(&mut self, prim: PrimId, shape: u32, geometry: Primitive) {
+        if self.emits(shape) {
             self.emissive.push(EmissivePrimitive { prim, shape, geometry });
         }
     }

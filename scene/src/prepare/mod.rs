@@ -5,7 +5,7 @@
 //!    spool: in memory while they are few, else in a temporary file.
 //! 3. *Counting*: now the number of splits is known. All candidate grids are counted in one pass over the spool.
 //! 4. *Building*: per split, what lies in which cell of the chosen grid; its tree and attributes are built and stored; primitives of
-//!    contested cells are dealt to groups.
+//!    cells that are copied are dealt to groups.
 //! 5. *Reducing*: groups are joined to new splits, which are built and stored.
 //!
 //! Memory: one batch of the source, the spool's share, the grid tables, and as many splits as there are threads. Every step that runs
@@ -156,6 +156,7 @@ pub fn prepare(
     let world = world(description, &mut ingested)?;
     let world_bytes = serde_json::to_vec(&world).map_err(|e| PrepareError::Inconsistent(e.to_string()))?;
     let content = content_hash(&offset, &ingested.hash, &world_bytes);
+    let inner = ingested.inner();
     let Ingested { spool, counts, lo, hi, .. } = ingested;
     let spool_error = |source| PrepareError::Spool { folder: spool.folder().clone(), source };
 
@@ -167,12 +168,15 @@ pub fn prepare(
         return Err(PrepareError::TooManySplits(ranges.len() as u64));
     }
     let (cells, mut choice) =
-        choose_grid(&spool, &ranges, (lo, hi), capacity, settings, progress).map_err(spool_error)?;
+        choose_grid(&spool, &ranges, (inner, lo, hi), capacity, settings, progress).map_err(spool_error)?;
 
     // 4
+    let sizes: Vec<u64> = ranges.iter().map(|r| r.end - r.start).collect();
+    let copied = if settings.overlap_reduction { overlap::copied(&cells.counted, &sizes) } else { Vec::new() };
+    choice.copied_cells = copied.iter().filter(|&&c| c).count() as u64;
     let groups = settings
         .overlap_reduction
-        .then(|| overlap::group(&cells.lattice, &cells.indices, &cells.primitives, &cells.contested, capacity.copied));
+        .then(|| overlap::group(&cells.lattice, &cells.indices, &cells.primitives, &copied, capacity.copied));
     let mut building = Building {
         store: &store,
         cells: &cells,
@@ -197,7 +201,7 @@ pub fn prepare(
     choice.rewritten_bytes = of_copies().map(|s| s.geometry.bytes + s.attributes.bytes).sum();
 
     let world = store.put(ObjectKind::Manifest, &world_bytes)?;
-    let grid = grid_data(&cells, &boxes, owners, lo, hi);
+    let grid = grid_data(&cells, &boxes, owners, (inner, lo, hi));
     let defaults = Defaults::of(description);
     let settings = settings.clone();
     let manifest = Manifest {
@@ -292,7 +296,7 @@ fn sample(spool: &Spool, cut: Cut, primitives: u64) -> Result<Vec<(u64, u64)>, P
 fn choose_grid(
     spool: &Spool,
     ranges: &[Range<u64>],
-    (lo, hi): ([f32; 3], [f32; 3]),
+    (inner, lo, hi): ([[f32; 3]; 2], [f32; 3], [f32; 3]),
     capacity: Capacity,
     settings: &PrepareSettings,
     progress: &dyn PrepareProgress,
@@ -301,7 +305,7 @@ fn choose_grid(
     progress.begin(Stage::Counting, Some(ranges.len() as u64));
     let mut counters = Vec::new();
     for subdiv in candidates(splits, settings) {
-        counters.push(Counter::new(Lattice::new(subdiv, lo, hi).map_err(io::Error::other)?));
+        counters.push(Counter::new(Lattice::around(subdiv, inner, lo, hi).map_err(io::Error::other)?));
     }
     for (split, range) in (0..).zip(ranges) {
         let records = spool.range(range)?;
@@ -319,6 +323,7 @@ fn choose_grid(
         stopped_by,
         capacity: capacity.source,
         contested_cells: 0,
+        copied_cells: 0,
         contested_primitives: 0,
         copies: 0,
         rewritten_bytes: 0,
@@ -326,8 +331,13 @@ fn choose_grid(
     Ok((cells, choice))
 }
 
-fn grid_data(cells: &ChosenCells, boxes: &[CellBox], owners: Vec<Vec<u32>>, lo: [f32; 3], hi: [f32; 3]) -> GridData {
-    let mut out = GridData { subdiv: cells.lattice.subdiv(), lo, hi, cells: Vec::new() };
+fn grid_data(
+    cells: &ChosenCells,
+    boxes: &[CellBox],
+    owners: Vec<Vec<u32>>,
+    ([inner_lo, inner_hi], lo, hi): ([[f32; 3]; 2], [f32; 3], [f32; 3]),
+) -> GridData {
+    let mut out = GridData { subdiv: cells.lattice.subdiv(), inner_lo, inner_hi, lo, hi, cells: Vec::new() };
     for (n, owners) in owners.into_iter().enumerate() {
         // a conservative test may have named a cell that nothing reaches
         if !boxes[n].is_empty() {

@@ -1,4 +1,4 @@
-//! Overlap reduction's second step: groups of contested cells joined to copied splits.
+//! Overlap reduction's second step: groups of cells joined to copied splits.
 
 use rayon::prelude::*;
 
@@ -9,7 +9,7 @@ use super::{Building, PrepareError, build_split};
 
 impl Building<'_> {
     /// Joins groups in their order while their distinct primitives are at most `capacity`, builds the splits and hands the
-    /// contested cells over to them.
+    /// cells over to them.
     pub(super) fn reduce(&mut self, capacity: u64, progress: &dyn PrepareProgress) -> Result<(), PrepareError> {
         let Some(groups) = self.groups else { return Ok(()) };
         progress.begin(Stage::Reducing, Some(u64::from(groups.count)));
