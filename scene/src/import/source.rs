@@ -162,6 +162,10 @@ impl Source {
                 Ok(0) => break,
                 Ok(k) => self.end += k,
                 Err(e) if e.kind() == io::ErrorKind::Interrupted => {}
+                // an error of the disk has a number, one of the packed data has none
+                Err(e) if matches!(self.input, Input::Gzip(_)) && e.raw_os_error().is_none() => {
+                    return self.fail_byte(format!("the gzip data is cut off or broken ({e}): get the file again"));
+                }
                 Err(e) => return Err(ImportError::Io { path: self.path.clone(), source: e }),
             }
         }

@@ -45,12 +45,17 @@ pub(crate) struct Ingested {
 }
 
 impl Ingested {
+    /// Whether anything does not emit light.
+    pub fn has_dark(&self) -> bool {
+        self.dark[0][0] <= self.dark[1][0]
+    }
+
     /// The box that the grid's equal cells fill: that of what does not emit light, if there is anything. Lamps are few, and
     /// may be far away. Its upper corner lies just outside where something is above, since a cell does not hold its
     /// upper face.
     pub fn inner(&self) -> Box3 {
         let [lo, hi] = self.dark;
-        if (0..3).any(|a| lo[a] > hi[a]) {
+        if !self.has_dark() {
             return [self.lo, self.hi];
         }
         [lo, std::array::from_fn(|a| if hi[a] < self.hi[a] { hi[a].next_up() } else { hi[a] })]
@@ -65,39 +70,48 @@ enum Skip {
     OutOfRange,
 }
 
-/// A pass over the source that finds its bounds.
-pub(crate) fn bounds(
+/// Shows every record of a source to `see`, in order; the bytes that were read for it.
+fn each(
     source: &dyn RecordSource,
+    stage: Stage,
     progress: &dyn PrepareProgress,
-) -> Result<Option<SourceBounds>, PrepareError> {
+    mut see: impl FnMut(&Record) -> Result<(), PrepareError>,
+) -> Result<u64, PrepareError> {
     let mut stream = source.open()?;
-    progress.begin(Stage::Bounds, None);
-    let (mut lo, mut hi) = ([f64::INFINITY; 3], [f64::NEG_INFINITY; 3]);
+    progress.begin(stage, None);
     let mut batch = Vec::with_capacity(BATCH);
     loop {
         batch.clear();
         let n = stream.next(&mut batch, BATCH)?;
         if n == 0 {
-            break;
+            return Ok(stream.bytes_read());
         }
         progress.advance(n as u64);
-        for record in &batch {
-            if sound(record).is_err() {
-                continue;
-            }
-            let mut add = |p: [f64; 3], r: f64| {
-                for a in 0..3 {
-                    lo[a] = lo[a].min(p[a] - r);
-                    hi[a] = hi[a].max(p[a] + r);
-                }
-            };
-            match record {
-                Record::Triangle(t) => t.p.iter().for_each(|p| add(*p, 0.0)),
-                Record::Sphere(s) => add(s.center, s.radius),
-            }
-        }
+        batch.iter().try_for_each(&mut see)?;
     }
-    Ok((lo[0] <= hi[0]).then_some(SourceBounds { lo, hi, bytes: stream.bytes_read() }))
+}
+
+/// A pass over the source that finds its bounds.
+pub(crate) fn bounds(
+    source: &dyn RecordSource,
+    progress: &dyn PrepareProgress,
+) -> Result<Option<SourceBounds>, PrepareError> {
+    let (mut lo, mut hi) = ([f64::INFINITY; 3], [f64::NEG_INFINITY; 3]);
+    let bytes = each(source, Stage::Bounds, progress, |record| {
+        let mut add = |p: [f64; 3], r: f64| {
+            for a in 0..3 {
+                lo[a] = lo[a].min(p[a] - r);
+                hi[a] = hi[a].max(p[a] + r);
+            }
+        };
+        match record {
+            _ if sound(record).is_err() => {}
+            Record::Triangle(t) => t.p.iter().for_each(|p| add(*p, 0.0)),
+            Record::Sphere(s) => add(s.center, s.radius),
+        }
+        Ok(())
+    })?;
+    Ok((lo[0] <= hi[0]).then_some(SourceBounds { lo, hi, bytes }))
 }
 
 /// Whether bounds that an importer found can be used.
@@ -113,8 +127,6 @@ pub(crate) fn ingest(
     settings: &SpoolSettings,
     progress: &dyn PrepareProgress,
 ) -> Result<Ingested, PrepareError> {
-    let mut stream = source.open()?;
-    progress.begin(Stage::Reading, None);
     let mut reader = Reader {
         offset,
         description,
@@ -127,19 +139,7 @@ pub(crate) fn ingest(
         emissive: Vec::new(),
         hashers: Default::default(),
     };
-    let mut batch = Vec::with_capacity(BATCH);
-    loop {
-        batch.clear();
-        let n = stream.next(&mut batch, BATCH)?;
-        if n == 0 {
-            break;
-        }
-        progress.advance(n as u64);
-        for record in &batch {
-            reader.add(record)?;
-        }
-    }
-    reader.counts.source_bytes = stream.bytes_read();
+    reader.counts.source_bytes = each(source, Stage::Reading, progress, |record| reader.add(record))?;
     reader.flush()?;
     let mut hasher = blake3::Hasher::new();
     for part in &reader.hashers {
@@ -147,6 +147,11 @@ pub(crate) fn ingest(
     }
     let Reader { spool, counts, lo, hi, dark, emissive, .. } = reader;
     Ok(Ingested { spool, counts, lo, hi, dark, emissive, hash: hasher.finalize() })
+}
+
+/// Whether an emission is light.
+pub(crate) fn emits(emission: Option<[f32; 3]>) -> bool {
+    emission.is_some_and(|e| e.iter().any(|&x| x > 0.0))
 }
 
 struct Reader<'a> {
@@ -232,8 +237,7 @@ impl Reader<'_> {
     }
 
     fn emits(&self, shape: u32) -> bool {
-        let emission = self.description.shapes.get(shape as usize).and_then(|s| s.emission);
-        emission.is_some_and(|e| e.iter().any(|&x| x > 0.0))
+        emits(self.description.shapes.get(shape as usize).and_then(|s| s.emission))
     }
 
     fn emit(&mut self, prim: PrimId, shape: u32, geometry: Primitive) {

@@ -84,9 +84,9 @@ pub enum PrepareError {
     Settings(String),
     /// Nothing can be hit.
     #[error(
-        "the scene has no primitive that can be hit: of {records} records, {degenerate} have no area, {non_finite} hold \
-         NaN or infinity and {out_of_range} lie beyond 2^39 units; check that the file is the right one and not cut off, and \
-         that its scale is sane"
+        "the scene has no primitive that can be hit, lights aside: of {records} records, {degenerate} have no area, \
+         {non_finite} hold NaN or infinity and {out_of_range} lie beyond 2^39 units; check that the file is the right one \
+         and not cut off, that its scale is sane, and that a volume has values on both sides of the iso value"
     )]
     Empty {
         /// Records in the source.
@@ -243,7 +243,9 @@ fn read(
     let offset = std::array::from_fn(|a| 0.5 * (lo[a] + hi[a]));
     let mut ingested = ingest::ingest(description, source, offset, spool, progress)?;
     let Counts { records, triangles, spheres, degenerate, non_finite, out_of_range, .. } = ingested.counts;
-    if triangles + spheres == 0 {
+    // lights that were added to a surface are no scene; lights alone that the source has are one
+    let meant_dark = description.shapes.iter().any(|s| !ingest::emits(s.emission));
+    if triangles + spheres == 0 || (meant_dark && !ingested.has_dark()) {
         return Err(PrepareError::Empty { records, degenerate, non_finite, out_of_range });
     }
     ingested.counts.source_reads = 2;

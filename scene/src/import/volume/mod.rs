@@ -1,7 +1,7 @@
 //! Volumes: what a file says of them, and their slices one at a time.
 //!
 //! World space is LPS in millimetres, DICOM's: x to the patient's left, y to the back, z to the head. NIfTI's RAS and NRRD's
-//! named spaces are converted.
+//! named spaces are converted. An NRRD without space and directions has its first slice on top.
 
 mod dicom;
 mod layout;

@@ -36,6 +36,10 @@ const IGNORED: &[&str] = &[
     "measurement frame",
 ];
 
+/// Signs to LPS where the header says nothing of orientation: the first slice is on top, as scanners number them (the
+/// patient's head), and rows run to the patient's right. A half turn around y, which mirrors nothing.
+const UNORIENTED: [f64; 3] = [-1.0, 1.0, -1.0];
+
 #[derive(Default)]
 struct Header {
     dimension: Option<u64>,
@@ -326,18 +330,24 @@ fn finish(path: &Path, h: Header, header_bytes: u64, lines: u64) -> Result<Volum
     Ok(VolumeFile { volume, layout, header_bytes })
 }
 
-/// A data file, which must not leave the header's folder.
+/// A data file, which must not leave the header's folder, by links neither.
 fn inside_folder(header: &Path, line: u32, name: &str) -> Result<PathBuf, ImportError> {
     let name = Path::new(name.trim());
+    let outside = || {
+        let message = format!("data file {} is outside the header's folder: put it beside the header", name.display());
+        malformed(header, line, message)
+    };
     let plain = name.components().all(|c| matches!(c, Component::Normal(_) | Component::CurDir));
     if !plain || name.as_os_str().is_empty() {
-        return Err(malformed(
-            header,
-            line,
-            format!("data file {} is outside the header's folder: put it beside the header", name.display()),
-        ));
+        return Err(outside());
     }
-    Ok(header.parent().unwrap_or(Path::new("")).join(name))
+    let folder = match header.parent() {
+        Some(folder) if !folder.as_os_str().is_empty() => folder,
+        _ => Path::new("."),
+    };
+    let path = folder.join(name);
+    let canonical = |path: &Path| path.canonicalize().map_err(|source| ImportError::Io { path: path.into(), source });
+    if canonical(&path)?.starts_with(canonical(folder)?) { Ok(path) } else { Err(outside()) }
 }
 
 fn placement(path: &Path, h: &Header) -> Result<Affine, ImportError> {
@@ -357,7 +367,11 @@ fn placement(path: &Path, h: &Header) -> Result<Affine, ImportError> {
         }
         (None, None) => std::array::from_fn(|c| std::array::from_fn(|r| f64::from(u8::from(r == c)))),
     };
-    let signs = h.signs.unwrap_or([1.0; 3]);
+    let signs = match (h.signs, &h.directions) {
+        (Some(signs), _) => signs,
+        (None, Some(_)) => [1.0; 3],
+        (None, None) => UNORIENTED,
+    };
     let origin = h.origin.unwrap_or([0.0; 3]);
     super::affine(path, |r, c| signs[r] * columns[c][r], |r| signs[r] * origin[r])
 }

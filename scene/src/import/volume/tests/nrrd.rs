@@ -118,9 +118,12 @@ fn placement() {
         let content = attached(&format!("encoding: raw\nendian: little\n{more}"), &shorts(false));
         open(&folder.write("p.nrrd", &content)).unwrap().volume().to_world.0
     };
-    let plain = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]];
-    assert_eq!(place(""), plain);
-    assert_eq!(place("spacings: 3.5 2 1e-1\n"), [[3.5, 0.0, 0.0, 0.0], [0.0, 2.0, 0.0, 0.0], [0.0, 0.0, 0.1, 0.0]]);
+    // no orientation: the first slice on top, and a turn, not a mirror
+    let plain = |[x, y, z]: [f64; 3]| [[-x, 0.0, 0.0, 0.0], [0.0, y, 0.0, 0.0], [0.0, 0.0, -z, 0.0]];
+    assert_eq!(place(""), plain([1.0; 3]));
+    assert_eq!(place("spacings: 3.5 2 1e-1\n"), plain([3.5, 2.0, 0.1]));
+    let upright = [[3.5, 0.0, 0.0, 0.0], [0.0, 2.0, 0.0, 0.0], [0.0, 0.0, 0.1, 0.0]];
+    assert_eq!(place("space: LPS\nspacings: 3.5 2 1e-1\n"), upright);
     let directions = "space directions: (0,1,2) (-3,4, 5) (6,7,-8.5)\nspace origin: (10,20,30)\n";
     let lps = [[0.0, -3.0, 6.0, 10.0], [1.0, 4.0, 7.0, 20.0], [2.0, 5.0, -8.5, 30.0]];
     assert_eq!(place(&format!("space: left-posterior-superior\n{directions}")), lps);
@@ -136,6 +139,28 @@ fn placement() {
     assert_eq!(place(&format!("space: right-anterior-superior\n{directions}")), negated(&[0, 1]));
     assert_eq!(place(&format!("space: LAS\n{directions}")), negated(&[1]));
     assert_eq!(place(&format!("space: 3D-left-handed\n{directions}")), negated(&[0]));
+}
+
+#[test]
+fn links_do_not_lead_outside() {
+    let folder = Folder::new();
+    std::fs::create_dir(folder.path().join("in")).unwrap();
+    folder.write("secret.raw", &shorts(false));
+    folder.write("in/own.raw", &shorts(false));
+    let link = |to: &str, name: &str| std::os::unix::fs::symlink(to, folder.path().join("in").join(name)).unwrap();
+    link("../secret.raw", "file.raw");
+    link("..", "up");
+    link("own.raw", "inside.raw");
+    let header = |data: &str| {
+        let more = format!("encoding: raw\nendian: little\ndata file: {data}\n");
+        folder.write("in/h.nhdr", &header("3 2 4", "short", &more))
+    };
+    for data in ["own.raw", "inside.raw", "./own.raw"] {
+        assert_eq!(slices(&open(&header(data)).unwrap()).unwrap(), counting(4), "{data}");
+    }
+    for data in ["file.raw", "up/secret.raw"] {
+        assert!(error(&header(data)).contains("outside the header's folder"), "{data}");
+    }
 }
 
 #[test]
