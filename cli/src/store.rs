@@ -8,7 +8,7 @@ use std::sync::Arc;
 use anyhow::Context;
 use clap::Args;
 use rayherd_herd::store::{
-    BlockStore, DirectoryStore, Prefixed, RetryPolicy, Retrying, S3Settings, S3Store, SceneObjects,
+    BlockStore, DirectoryStore, Prefixed, RetryPolicy, Retrying, S3Settings, S3Store, SceneObjects, StoreError,
 };
 use rayherd_render::frame::Frame;
 use rayherd_scene::objects::{DirectoryObjects, ObjectHash, ObjectStore};
@@ -45,7 +45,15 @@ impl Store {
         let runtime = runtime.context("cannot start a thread for input and output")?;
         if address.starts_with("s3://") {
             let settings = S3Settings::from_url(address, s3.s3_endpoint.as_deref())?;
-            let bucket = runtime.block_on(S3Store::connect(settings))?;
+            let server = settings.endpoint.clone().unwrap_or_else(|| format!("AWS in {}", settings.region));
+            let bucket = runtime.block_on(S3Store::connect(settings)).map_err(|error| {
+                let remedy = match error {
+                    StoreError::Unavailable { .. } => "see that the server runs and that --s3-endpoint is its address",
+                    StoreError::Denied { .. } => "see that AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY are its keys",
+                    _ => "see that the address and the bucket are right",
+                };
+                anyhow::Error::new(error).context(format!("cannot open {address} at {server} ({remedy})"))
+            })?;
             let blocks: Arc<dyn BlockStore> = Arc::new(Retrying::new(Arc::new(bucket), RetryPolicy::default()));
             let objects = Arc::new(SceneObjects::new(blocks.clone(), runtime.handle().clone())?);
             return Ok(Store { blocks, objects, runtime });

@@ -48,6 +48,11 @@ fn bad_input_is_a_mistake_that_says_what_to_do() {
     write("cut.xml", b"<scene version='3.0.0'><shape type='rectangle'>");
     write("noise.ply", &(0..4096u32).map(|i| (i.wrapping_mul(2_654_435_761) >> 24) as u8).collect::<Vec<_>>());
     write("nan.obj", b"v nan 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n");
+    write("flat.obj", b"v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n");
+    // a gzip head, and nothing that it promises
+    write("cut.ply.gz", b"\x1f\x8b\x08\0\0\0\0\0\0\x03");
+    let even = "NRRD0004\ntype: uchar\ndimension: 3\nsizes: 2 2 2\nencoding: raw\n\n\0\0\0\0\0\0\0\0";
+    write("even.nrrd", even.as_bytes());
     fs::create_dir(folder.path().join("folder")).unwrap();
     let prepare = |scene: &str, more: &[&str]| {
         let mut arguments = vec!["prepare", scene, "--store", "s"];
@@ -60,6 +65,9 @@ fn bad_input_is_a_mistake_that_says_what_to_do() {
     assert_mistake(&prepare("noise.ply", &[]), &["noise.ply"]);
     assert_mistake(&prepare("nan.obj", &[]), &["nan.obj"]);
     assert_mistake(&prepare("folder", &[]), &["folder"]);
+    assert_mistake(&prepare("flat.obj", &[]), &["flat.obj", "lights aside", "of 5 records, 1 have no area"]);
+    assert_mistake(&prepare("cut.ply.gz", &[]), &["cut.ply.gz", "gzip data is cut off", "get the file again"]);
+    assert_mistake(&prepare("even.nrrd", &["--iso", "5"]), &["even.nrrd", "lights aside", "iso value"]);
     assert_mistake(&prepare("empty.xml", &["--splits", "0"]), &["--splits is 0: give 1 to 1000000"]);
     assert_mistake(&prepare("empty.xml", &["--block-size", "64K"]), &["--block-size", "ambiguous"]);
     assert_mistake(&prepare("empty.xml", &["--overlap-threshold", "2"]), &["--overlap-threshold is 2: give 0 to 1"]);

@@ -64,7 +64,9 @@ fn choose(shown: &str, s3: &S3Options, wanted: Option<&str>) -> anyhow::Result<(
     if !shown.starts_with("s3://") && !Path::new(shown).join("names").is_dir() {
         return Err(none().into());
     }
-    let store = Store::existing(shown, s3)?.objects;
+    // it runs what its objects are read with
+    let opened = Store::existing(shown, s3)?;
+    let store = &opened.objects;
     let mut scenes: Vec<ObjectRef> = Vec::new();
     for name in store.names()?.iter().filter(|n| n.starts_with("scene-")) {
         let object = store.name(name)?.with_context(|| format!("{shown}: name {name} has gone"))?;

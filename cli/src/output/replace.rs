@@ -13,13 +13,24 @@ pub fn probe(path: &Path) -> anyhow::Result<()> {
     if path.is_dir() {
         return Err(Mistake(format!("cannot write {}: it is a folder; name a file", path.display())).into());
     }
+    if is_device(path) {
+        return Ok(());
+    }
     let temporary = beside(path);
     let made = create(&temporary).and_then(|_| fs::remove_file(&temporary));
     made.map_err(|e| Mistake(format!("cannot write {}: {e}; choose another place with -o", path.display())).into())
 }
 
-/// Replaces `path` by `bytes`, on the disk when it returns.
+/// Whether something is there that takes bytes but is no file: a device, a pipe, a socket. It must not be replaced by one.
+fn is_device(path: &Path) -> bool {
+    fs::metadata(path).is_ok_and(|m| !m.is_file() && !m.is_dir())
+}
+
+/// Replaces `path` by `bytes`, on the disk when it returns; a device or a pipe is written to.
 pub fn replace(path: &Path, bytes: &[u8]) -> io::Result<()> {
+    if is_device(path) {
+        return OpenOptions::new().write(true).open(path)?.write_all(bytes);
+    }
     let temporary = beside(path);
     let written = create(&temporary)
         .and_then(|mut file| file.write_all(bytes).and_then(|()| file.sync_all()))
@@ -73,6 +84,23 @@ fn create(path: &Path) -> io::Result<File> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_device_stays_a_device() {
+        let device = Path::new("/dev/full");
+        if !is_device(device) {
+            eprintln!("this system has no /dev/full: not tested");
+            return;
+        }
+        probe(device).unwrap();
+        assert_eq!(replace(device, b"x").unwrap_err().kind(), io::ErrorKind::StorageFull);
+        assert!(is_device(device));
+        let folder = tempfile::tempdir().unwrap();
+        let link = folder.path().join("link");
+        std::os::unix::fs::symlink(device, &link).unwrap();
+        assert!(replace(&link, b"x").is_err());
+        assert_eq!(names(folder.path()), ["link"]);
+    }
 
     fn names(folder: &Path) -> Vec<String> {
         let mut names: Vec<String> =

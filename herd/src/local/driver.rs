@@ -212,6 +212,8 @@ struct Driver<'s, 'a> {
     hops: u64,
     hop_bytes: u64,
     error: Option<f64>,
+    /// When the error that is shown is found again.
+    next_error: Instant,
 }
 
 impl<'s, 'a> Driver<'s, 'a> {
@@ -264,6 +266,7 @@ impl<'s, 'a> Driver<'s, 'a> {
             hops: 0,
             hop_bytes: 0,
             error: None,
+            next_error: Instant::now(),
         }
     }
 

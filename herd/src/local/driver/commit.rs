@@ -1,6 +1,7 @@
 //! From what an attempt reports to what counts.
 
 use std::sync::mpsc::Receiver;
+use std::time::{Duration, Instant};
 
 use super::{Driver, Message, Objects, image};
 use crate::job::JobError;
@@ -8,6 +9,11 @@ use crate::ledger::{Record, Refused, TaskId};
 use crate::local::attempt::Made;
 use crate::local::faults::Fate;
 use crate::local::journal;
+
+/// The error that is shown is not found more often.
+const ERROR_EVERY: Duration = Duration::from_secs(1);
+/// Nor does finding it take more than one part in so many of the time.
+const ERROR_SHARE: u32 = 50;
 
 /// Commits between two snapshots.
 const SNAPSHOT_EVERY: u64 = 16;
@@ -105,6 +111,12 @@ impl Driver<'_, '_> {
         if self.progress.wants_preview() {
             let spp = self.ledger.taken().reach().max(1);
             self.progress.preview(&image(&self.film, spp));
+        }
+        // for the display: about, since some pixels may wait for samples that others have. What decides is in `step_done`
+        if Instant::now() >= self.next_error {
+            let begun = Instant::now();
+            self.error = self.film.rel_mse(self.ledger.taken().reach()).or(self.error);
+            self.next_error = Instant::now() + ERROR_EVERY.max(ERROR_SHARE * begun.elapsed());
         }
         Ok(())
     }
