@@ -126,7 +126,7 @@ fn gzip_is_unpacked() {
     assert_eq!(out.bytes_read, packed.len() as u64);
     assert_eq!(records(&out).unwrap().len(), 5);
     let path = write(&dir, "b.ply.gz", &packed[..packed.len() - 12]);
-    assert!(matches!(import(&path, &ImportOptions::default()), Err(ImportError::Io { .. })));
+    assert!(matches!(import(&path, &ImportOptions::default()), Err(ImportError::Malformed { .. })));
 }
 
 #[test]

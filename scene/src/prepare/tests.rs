@@ -242,43 +242,6 @@ fn every_primitive_is_where_the_grid_says() {
 }
 
 #[test]
-fn a_lamp_far_away_does_not_stretch_the_grid() {
-    let mut records = scene(3, 1500);
-    let store = MemoryObjects::new();
-    let near = run(&records, &settings(23, true), &store).unwrap().manifest;
-    let lamp = |x: f64, shape: u32| {
-        let corner = |dx: f64, dy: f64| [1000.0 + x + dx, 1000.0 + dy, 1000.0 + 0.1 * x];
-        Record::Triangle(TriangleRecord {
-            p: [corner(-1.0, -1.0), corner(1.0, -1.0), corner(0.0, 1.0)],
-            n: None,
-            uv: None,
-            shape,
-        })
-    };
-    records.extend([lamp(80.0, 1), lamp(-60.0, 1)]);
-    let far = run(&records, &settings(23, true), &store).unwrap().manifest;
-    assert_eq!(far.grid.subdiv, near.grid.subdiv);
-    let inner = |m: &Manifest| -> [f64; 3] { std::array::from_fn(|a| f64::from(m.grid.inner_lo[a]) + m.offset[a]) };
-    // emitting shapes are among the first 1500 too, so the boxes need not be equal, but they are as wide
-    assert!((0..3).all(|a| (inner(&far)[a] - inner(&near)[a]).abs() < 1e-3 && far.hi[0] - far.lo[0] > 100.0));
-    // the lamps' cells belong to the outer layer, and no split of the source is kept for them
-    let lattice = far.grid.lattice().unwrap();
-    let outer: Vec<&CellData> = far
-        .grid
-        .cells
-        .iter()
-        .filter(|c| lattice.coordinates(c.index).is_some_and(|at| at[0] == 0 || at[0] + 1 == lattice.count(0)))
-        .collect();
-    assert!(!outer.is_empty() && outer.iter().all(|c| far.splits[c.owners[0] as usize].copied));
-    // the same two dark: now they are part of what the cells divide
-    let end = records.len();
-    records.splice(end - 2.., [lamp(80.0, 0), lamp(-60.0, 0)]);
-    let dark = run(&records, &settings(23, true), &store).unwrap().manifest;
-    assert!(dark.grid.subdiv > near.grid.subdiv);
-    assert_eq!((dark.grid.inner_lo, dark.grid.inner_hi), (dark.lo, dark.hi));
-}
-
-#[test]
 fn the_bytes_do_not_depend_on_threads_or_the_spool() {
     let records = scene(5, 3000);
     let mut first: Option<(ObjectRef, BTreeMap<ObjectHash, Vec<u8>>)> = None;
