@@ -5,6 +5,7 @@
 
 mod arena;
 pub mod block;
+mod boxes;
 mod check;
 mod collapse;
 pub mod forest;

@@ -10,7 +10,7 @@ use std::collections::BinaryHeap;
 use super::check::Tree;
 use super::collapse::{Content, Plan};
 use super::layout::*;
-use super::{Serial, sah};
+use super::{Serial, boxes};
 
 /// Entries that a block is opened into, at most: slabs that overlap along a whole axis then cost some per cent.
 const ENTRIES: usize = 512;
@@ -78,7 +78,8 @@ impl Top {
     /// Builds the tree in bytes that `place` provides: given their number, a part of the arena and its offset. Returns the
     /// tree; `None` when `place` has no room.
     pub fn build<'a>(&self, place: impl FnOnce(usize) -> Option<(&'a mut [u8], usize)>) -> Option<Tree> {
-        let binary = sah::build(self.entries.iter().map(|e| e.aabb), &Serial);
+        let boxes: Vec<Aabb> = self.entries.iter().map(|e| e.aabb).collect();
+        let binary = boxes::build(&boxes);
         let plan = Plan::new(&binary, self, &Serial);
         let (out, at) = place(plan.bytes)?;
         let aabb = plan.write(out, at);
