@@ -15,6 +15,9 @@ use crate::options::import_options;
 /// Imports and prepares the scene of a job that was checked.
 pub fn open(spec: &RenderJobSpec, objects: &dyn ObjectStore) -> anyhow::Result<Prepared> {
     let description = import(Path::new(&spec.scene.source), &import_options(spec))?;
+    for s in &description.substitutions {
+        tracing::warn!("{}: {} is not supported; in its place: {}", s.place, s.what, s.stand_in);
+    }
     let source = DescriptionSource::new(&description, StreamOptions::default());
     let progress = StageBar::new();
     let prepared =

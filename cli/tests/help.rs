@@ -4,7 +4,7 @@ mod common;
 
 use common::rayherd;
 
-const COMMANDS: [&str; 7] = ["render", "prepare", "inspect", "compare", "replay", "gc", "scene"];
+const COMMANDS: [&str; 8] = ["render", "check", "prepare", "inspect", "compare", "replay", "gc", "scene"];
 
 #[test]
 fn every_command_has_help_with_an_example() {

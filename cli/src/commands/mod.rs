@@ -1,5 +1,6 @@
 //! The commands, one a file.
 
+mod check;
 mod compare;
 mod gc;
 mod inspect;
@@ -17,6 +18,7 @@ use clap::Subcommand;
 #[derive(Subcommand)]
 pub enum Command {
     Render(Box<render::Arguments>),
+    Check(check::Arguments),
     Prepare(prepare::Arguments),
     Inspect(inspect::Arguments),
     Compare(compare::Arguments),
@@ -34,6 +36,7 @@ pub fn run(command: Command) -> anyhow::Result<ExitCode> {
         Command::Gc(arguments) => gc::run(&arguments),
         Command::Scene(arguments) => scene::run(&arguments),
         Command::Inspect(arguments) => inspect::run(&arguments),
+        Command::Check(arguments) => check::run(&arguments),
         Command::Prepare(arguments) => prepare::run(&arguments),
     }
 }

@@ -6,7 +6,7 @@ use crate::description::{Description, Geometry, Shape};
 use crate::record::{Record, RecordSource};
 
 /// Nothing: grows by any point.
-const EMPTY: [[f64; 3]; 2] = [[f64::INFINITY; 3], [f64::NEG_INFINITY; 3]];
+pub(super) const EMPTY: [[f64; 3]; 2] = [[f64::INFINITY; 3], [f64::NEG_INFINITY; 3]];
 
 /// Bounds of the finite primitives of a source, by a pass over it; least above greatest if there are none.
 pub fn bounds(source: &dyn RecordSource) -> Result<([[f64; 3]; 2], u64), ImportError> {
@@ -18,17 +18,29 @@ pub fn bounds(source: &dyn RecordSource) -> Result<([[f64; 3]; 2], u64), ImportE
         if stream.next(&mut records, 4096)? == 0 {
             return Ok((out, stream.bytes_read()));
         }
-        for record in &records {
-            match record {
-                Record::Triangle(t) if t.p.iter().flatten().all(|x| x.is_finite()) => {
-                    t.p.iter().for_each(|p| grow(&mut out, *p));
-                }
-                Record::Sphere(s) if s.center.iter().all(|x| x.is_finite()) && s.radius.is_finite() => {
-                    grow(&mut out, s.center.map(|x| x - s.radius));
-                    grow(&mut out, s.center.map(|x| x + s.radius));
-                }
-                _ => {}
+        records.iter().for_each(|record| {
+            add(&mut out, record);
+        });
+    }
+}
+
+/// Grows by a primitive; false (and no growth) when it is not finite.
+pub(super) fn add(bounds: &mut [[f64; 3]; 2], record: &Record) -> bool {
+    match record {
+        Record::Triangle(t) => {
+            let finite = t.p.iter().flatten().all(|x| x.is_finite());
+            if finite {
+                t.p.iter().for_each(|p| grow(bounds, *p));
             }
+            finite
+        }
+        Record::Sphere(s) => {
+            let finite = s.center.iter().all(|x| x.is_finite()) && s.radius.is_finite();
+            if finite {
+                grow(bounds, s.center.map(|x| x - s.radius));
+                grow(bounds, s.center.map(|x| x + s.radius));
+            }
+            finite
         }
     }
 }

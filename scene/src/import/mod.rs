@@ -18,6 +18,7 @@ mod source;
 mod spill;
 mod stl;
 mod stream;
+mod survey;
 pub(crate) mod vector;
 pub mod volume;
 
@@ -31,6 +32,7 @@ pub use options::{
 pub use placement::Placement;
 pub(crate) use spill::temporary_file;
 pub use stream::{DescriptionSource, StreamOptions};
+pub use survey::{ShapeSurvey, Survey};
 
 use crate::ImportError;
 use crate::description::{Bsdf, Description, Material, MeshFormat, Place};
@@ -104,9 +106,6 @@ fn read(path: &Path, options: &ImportOptions) -> Result<(Description, Up, bool),
     };
     if out.shapes.is_empty() {
         return refuse(path, "the scene has no shapes: there is nothing to render");
-    }
-    for s in &out.substitutions {
-        tracing::warn!("{}: {} is not supported; in its place: {}", s.place, s.what, s.stand_in);
     }
     Ok((out, up, bare))
 }

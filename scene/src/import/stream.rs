@@ -67,6 +67,11 @@ impl<'a> DescriptionSource<'a> {
         self.spilled.load(Ordering::Relaxed)
     }
 
+    /// A pass over one shape.
+    pub(super) fn open_one(&self, number: usize) -> Result<Box<dyn RecordStream + '_>, ImportError> {
+        self.open_shape(number, &self.description.shapes[number])
+    }
+
     /// The records of one shape.
     fn open_shape(&self, number: usize, shape: &'a Shape) -> Result<Box<dyn RecordStream + '_>, ImportError> {
         let number = number as u32;

@@ -1,0 +1,138 @@
+//! `rayherd check`: what a scene holds and what of it would not be read, before anything is prepared.
+
+use std::collections::BTreeMap;
+use std::fmt::Write;
+use std::path::Path;
+use std::process::ExitCode;
+
+use clap::Args;
+use rayherd_api::{RenderJob, RenderJobSpec};
+use rayherd_scene::description::{Bsdf, Description, Geometry, MeshFormat};
+use rayherd_scene::import::{ImportOptions, Survey, import};
+
+use super::{print, size};
+use crate::options::{self, SceneOptions, import_options};
+
+/// Say what a scene holds, what of it is not supported and what is missing; nothing is prepared or rendered
+///
+/// Exits with 2 when something is unsupported (each named with file and line; with --substitute that is allowed) or cannot be read.
+#[derive(Args)]
+#[command(after_help = "Examples:\n  rayherd check scene.xml\n  rayherd check chest --iso -789.5\n  \
+    rayherd check scene.xml --substitute")]
+pub struct Arguments {
+    /// Mitsuba XML, mesh (PLY, OBJ, STL), folder of meshes, or CT volume (DICOM folder, NRRD, NIfTI)
+    scene: String,
+    #[command(flatten)]
+    scene_options: SceneOptions,
+}
+
+/// Reads all of the source once and prints.
+pub fn run(arguments: &Arguments) -> anyhow::Result<ExitCode> {
+    let mut spec = RenderJobSpec::default();
+    spec.scene.source.clone_from(&arguments.scene);
+    arguments.scene_options.apply(&mut spec);
+    options::check(&RenderJob::new(spec.clone()), None)?;
+
+    // with stand-ins, to go on after the first thing that is not supported
+    let options = ImportOptions { substitute: true, ..import_options(&spec) };
+    let description = import(Path::new(&arguments.scene), &options)?;
+    let survey = Survey::of(&description);
+    let (text, mut problems) = (tell(&arguments.scene, &description, &survey), problems(&description, &survey));
+    for s in &description.substitutions {
+        let line = format!("{}: {} is not supported; --substitute puts in its place: {}", s.place, s.what, s.stand_in);
+        if spec.scene.substitute { tracing::info!("{line}") } else { problems.push(line) }
+    }
+    print(&text)?;
+    problems.iter().for_each(|p| eprintln!("{p}"));
+    if problems.is_empty() {
+        return Ok(ExitCode::SUCCESS);
+    }
+    eprintln!("error: {} in {}", count(problems.len() as u64, "problem"), arguments.scene);
+    Ok(ExitCode::from(2))
+}
+
+/// Shapes that cannot be read to their end.
+fn problems(description: &Description, survey: &Survey) -> Vec<String> {
+    let shapes = description.shapes.iter().zip(&survey.shapes);
+    shapes
+        .filter_map(|(shape, found)| {
+            let error = anyhow::Error::msg(found.error.as_ref()?.to_string());
+            Some(format!("{}: shape \"{}\": {}", shape.place, shape.name, crate::fault::tell(&error)))
+        })
+        .collect()
+}
+
+fn tell(scene: &str, description: &Description, survey: &Survey) -> String {
+    let mut out = format!("scene        {scene}\n");
+    let mut line = |name: &str, text: String| {
+        let _ = writeln!(out, "{name:12} {text}");
+    };
+    let (triangles, spheres) = (survey.sum(|s| s.triangles), survey.sum(|s| s.spheres));
+    line("source", format!("{} read", size(description.bytes_read + survey.bytes_read)));
+    line("shapes", kinds(description.shapes.iter().map(|s| geometry(&s.geometry))));
+    line("primitives", format!("{}, {}", count(triangles, "triangle"), count(spheres, "sphere")));
+    let (flat, bad) = (survey.sum(|s| s.flat), survey.sum(|s| s.not_finite));
+    line("skipped", format!("{flat} of zero area, {bad} with NaN or infinity"));
+    let [lo, hi] = survey.bounds;
+    if lo[0] <= hi[0] {
+        line("box", format!("{lo:.4?} to {hi:.4?}"));
+    }
+    line("materials", kinds(description.materials.iter().map(|m| bsdf(&m.bsdf))));
+    line("lights", lights(description, survey));
+    if let Some(camera) = &description.camera {
+        let [w, h] = description.size.unwrap_or([0, 0]);
+        line("camera", format!("perspective, {:.3} degrees across, {w}x{h}", camera.fov_x));
+    }
+    let total = survey.prepared_bytes();
+    line(
+        "prepared",
+        format!("about {}; a node needs memory for one split (--block-size, 128 MiB) at least", size(total)),
+    );
+    out
+}
+
+fn lights(description: &Description, survey: &Survey) -> String {
+    let emits = description.shapes.iter().zip(&survey.shapes).filter(|(s, _)| s.emission.is_some());
+    let primitives: u64 = emits.clone().map(|(_, found)| found.triangles + found.spheres).sum();
+    let sky = match description.environment {
+        Some(rgb) => format!(", sky of {rgb:?}"),
+        None => String::new(),
+    };
+    format!("{} of {}{sky}", count(emits.count() as u64, "shape"), count(primitives, "primitive"))
+}
+
+/// "3: 2 obj, 1 sphere".
+fn kinds<'a>(names: impl Iterator<Item = &'a str>) -> String {
+    let mut by_name: BTreeMap<&str, u64> = BTreeMap::new();
+    names.for_each(|name| *by_name.entry(name).or_default() += 1);
+    let list: Vec<String> = by_name.iter().map(|(name, n)| format!("{n} {name}")).collect();
+    format!("{}: {}", by_name.values().sum::<u64>(), list.join(", "))
+}
+
+fn count(n: u64, what: &str) -> String {
+    if n == 1 { format!("1 {what}") } else { format!("{n} {what}s") }
+}
+
+fn geometry(geometry: &Geometry) -> &'static str {
+    match geometry {
+        Geometry::MeshFile { format: MeshFormat::Ply, .. } => "ply",
+        Geometry::MeshFile { format: MeshFormat::Obj, .. } => "obj",
+        Geometry::MeshFile { format: MeshFormat::Stl, .. } => "stl",
+        Geometry::Inline { .. } => "rectangle or cube",
+        Geometry::Sphere { .. } => "sphere",
+        Geometry::IsoSurface { .. } => "surface of a volume",
+    }
+}
+
+fn bsdf(bsdf: &Bsdf) -> &'static str {
+    match bsdf {
+        Bsdf::Diffuse { .. } => "diffuse",
+        Bsdf::Conductor { .. } => "conductor",
+        Bsdf::RoughConductor { .. } => "rough conductor",
+        Bsdf::Dielectric { .. } => "dielectric",
+        Bsdf::ThinDielectric { .. } => "thin dielectric",
+        Bsdf::RoughDielectric { .. } => "rough dielectric",
+        Bsdf::Plastic { .. } => "plastic",
+        Bsdf::RoughPlastic { .. } => "rough plastic",
+    }
+}

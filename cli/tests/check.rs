@@ -1,0 +1,47 @@
+//! `rayherd check` from outside.
+
+mod common;
+
+use std::fs;
+
+use common::{rayherd, repository};
+
+#[test]
+fn a_good_scene_is_described_and_left_alone() {
+    let folder = tempfile::tempdir().unwrap();
+    let scene = repository("examples/veach-mis.xml");
+    let run = rayherd(folder.path(), &["check", scene.to_str().unwrap()]);
+    assert_eq!(run.code, 0, "{}", run.err);
+    for part in
+        ["52 triangles, 5 spheres", "4 rough conductor", "5 shapes of 5 primitives", "0 of zero area", "perspective"]
+    {
+        assert!(run.out.contains(part), "no {part:?} in {}", run.out);
+    }
+    assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 0);
+}
+
+/// Everything wrong is told at once: what is not supported, and each file that is missing or broken.
+#[test]
+fn all_problems_are_named() {
+    let folder = tempfile::tempdir().unwrap();
+    let text = "<scene version='3.0.0'>\n<shape type='obj'><string name='filename' value='gone.obj'/></shape>\n\
+        <shape type='ply'><string name='filename' value='cut.ply'/></shape>\n\
+        <shape type='rectangle'><bsdf type='ward'/></shape>\n\
+        <shape type='obj'><string name='filename' value='good.obj'/></shape>\n\
+        <emitter type='constant'/><sensor type='perspective'/></scene>";
+    fs::write(folder.path().join("s.xml"), text).unwrap();
+    fs::write(folder.path().join("cut.ply"), "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\n").unwrap();
+    fs::write(folder.path().join("good.obj"), "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 nan\nf 1 2 3\nf 1 1 2\nf 1 2 4\n")
+        .unwrap();
+    let run = rayherd(folder.path(), &["check", "s.xml"]);
+    assert_eq!(run.code, 2, "{}", run.err);
+    for part in ["gone.obj", "cut.ply", "s.xml:4: bsdf \"ward\" is not supported", "error: 3 problems in s.xml"] {
+        assert!(run.err.contains(part), "no {part:?} in {}", run.err);
+    }
+    for part in ["5 triangles", "1 of zero area, 1 with NaN", "1 rectangle or cube", "sky of"] {
+        assert!(run.out.contains(part), "no {part:?} in {}", run.out);
+    }
+    // a stand-in that was asked for is no problem
+    let run = rayherd(folder.path(), &["check", "s.xml", "--substitute"]);
+    assert!(run.code == 2 && run.err.contains("error: 2 problems"), "{}", run.err);
+}

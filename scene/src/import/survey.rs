@@ -1,0 +1,100 @@
+//! What a description holds, without preparing it: counts, bounds, files that cannot be read.
+
+use super::stream::{DescriptionSource, StreamOptions};
+use crate::ImportError;
+use crate::description::Description;
+use crate::record::Record;
+
+/// Of a geometry object a triangle takes about this (eight-wide nodes, vertices, ids; measured 51.8 on 8 million triangles).
+const BYTES_PER_TRIANGLE: u64 = 52;
+
+/// What was found in a description's shapes.
+#[derive(Debug)]
+pub struct Survey {
+    /// By shape.
+    pub shapes: Vec<ShapeSurvey>,
+    /// World-space box of all finite primitives; least above greatest if there are none.
+    pub bounds: [[f64; 3]; 2],
+    /// Bytes of the source that were read for it.
+    pub bytes_read: u64,
+}
+
+/// One shape.
+#[derive(Debug, Default)]
+pub struct ShapeSurvey {
+    /// Triangles, skipped ones too.
+    pub triangles: u64,
+    /// Spheres.
+    pub spheres: u64,
+    /// Triangles of no area, as f64 sees them: skipped when preparing.
+    pub flat: u64,
+    /// Primitives with NaN or infinite coordinates: skipped when preparing.
+    pub not_finite: u64,
+    /// Triangles with shading normals.
+    pub with_normals: u64,
+    /// Triangles with texture coordinates.
+    pub with_uv: u64,
+    /// Why it could not be read to its end.
+    pub error: Option<ImportError>,
+}
+
+impl Survey {
+    /// Reads every shape once. What cannot be read is noted, and the next shape is read.
+    pub fn of(description: &Description) -> Survey {
+        let source = DescriptionSource::new(description, StreamOptions::default());
+        let mut out = Survey { shapes: Vec::new(), bounds: super::bounds::EMPTY, bytes_read: 0 };
+        for number in 0..description.shapes.len() {
+            let mut shape = ShapeSurvey::default();
+            match read(&source, number, &mut shape, &mut out.bounds) {
+                Ok(bytes) => out.bytes_read += bytes,
+                Err(error) => shape.error = Some(error),
+            }
+            out.shapes.push(shape);
+        }
+        out
+    }
+
+    /// A sum over the shapes.
+    pub fn sum(&self, of: impl Fn(&ShapeSurvey) -> u64) -> u64 {
+        self.shapes.iter().map(of).sum()
+    }
+
+    /// About what the prepared scene takes, bytes, without copies by overlap reduction: trees and vertices; shape numbers, normals and
+    /// texture coordinates.
+    pub fn prepared_bytes(&self) -> u64 {
+        self.sum(|s| s.triangles * (BYTES_PER_TRIANGLE + 4) + s.with_normals * 36 + s.with_uv * 24 + s.spheres * 32)
+    }
+}
+
+fn read(
+    source: &DescriptionSource,
+    number: usize,
+    shape: &mut ShapeSurvey,
+    bounds: &mut [[f64; 3]; 2],
+) -> Result<u64, ImportError> {
+    let mut stream = source.open_one(number)?;
+    let mut records = vec![];
+    loop {
+        records.clear();
+        if stream.next(&mut records, 4096)? == 0 {
+            return Ok(stream.bytes_read());
+        }
+        for record in &records {
+            let finite = super::bounds::add(bounds, record);
+            shape.not_finite += u64::from(!finite);
+            match record {
+                Record::Triangle(t) => {
+                    shape.triangles += 1;
+                    shape.flat += u64::from(finite && super::vector::cross(edge(t.p, 1), edge(t.p, 2)) == [0.0; 3]);
+                    shape.with_normals += u64::from(t.n.is_some());
+                    shape.with_uv += u64::from(t.uv.is_some());
+                }
+                Record::Sphere(_) => shape.spheres += 1,
+            }
+        }
+    }
+}
+
+fn edge(p: [[f64; 3]; 3], to: usize) -> [f64; 3] {
+    super::vector::sub(p[to], p[0])
+}
