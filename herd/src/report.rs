@@ -30,6 +30,8 @@ pub enum Op {
 pub enum Kind {
     /// The scene's source files.
     Source,
+    /// The stream of primitives between the passes of preparing.
+    Spool,
     /// Manifest, grid, world.
     Manifest,
     /// Built blocks of splits.
@@ -198,6 +200,14 @@ pub struct Report {
 }
 
 impl Report {
+    /// Adds what preparing moved before; it belongs to no node, so nothing else follows from it.
+    pub fn add_prepare_bytes(&mut self, rows: impl IntoIterator<Item = (Op, Kind, u64)>) {
+        let mut all = Bytes::default();
+        self.bytes.iter().for_each(|r| all.add(r.stage, r.op, r.kind, r.place, r.bytes));
+        rows.into_iter().for_each(|(op, kind, bytes)| all.add(Stage::Prepare, op, kind, Place::Local, bytes));
+        self.bytes = all.rows();
+    }
+
     /// Sets `bytes` and what follows from them (DESIGN section 8); `scene_bytes`, `hops` must be set.
     pub fn set_bytes(&mut self, bytes: &Bytes) {
         let scene = |k: Kind| matches!(k, Kind::Geometry | Kind::Attributes | Kind::Texture);

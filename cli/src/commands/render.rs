@@ -10,9 +10,9 @@ use clap::Args;
 use rayherd_api::{RenderJob, RenderJobSpec};
 use rayherd_herd::job::{Commits, JobSettings, PreparedScene, Sampling};
 use rayherd_herd::local::{JobOutcome, render_local};
-use rayherd_herd::report::Report;
+use rayherd_herd::report::{Kind, Op, Report};
 use rayherd_scene::objects::ObjectStore;
-use rayherd_scene::prepare::Prepared;
+use rayherd_scene::prepare::{ByteKind, ByteOp, ByteRow, Prepared};
 use serde_json::json;
 
 use super::print;
@@ -113,6 +113,7 @@ pub fn run(arguments: &Arguments) -> anyhow::Result<ExitCode> {
     let settings = arguments.run.settings(&job.spec)?;
     use_threads(settings.threads)?;
     let files = frames::files(&job);
+    frames::check_files(&files)?;
     let pictures = files.iter().flat_map(|exr| [exr.clone(), exr.with_extension("png")]);
     for path in pictures.chain(arguments.preview.clone()).chain(arguments.report.clone()) {
         replace::probe(&path)?;
@@ -141,6 +142,7 @@ pub fn run(arguments: &Arguments) -> anyhow::Result<ExitCode> {
         let settings = JobSettings { commits, ..settings.clone() };
         let mut outcome = render(&scene, shot, &sampling, &settings, (preview, exposure))?;
         outcome.report.prepare = prepare_report(&prepared);
+        outcome.report.add_prepare_bytes(prepared.report.bytes.iter().map(prepare_row));
         let saved = save(&scene, shot, &outcome, exposure);
         match &keep.store {
             Some(place) => {
@@ -237,6 +239,21 @@ fn prepare_report(prepared: &Prepared) -> serde_json::Value {
         "took": prepared.report,
         "substitutions": m.defaults.substitutions,
     })
+}
+
+fn prepare_row(row: &ByteRow) -> (Op, Kind, u64) {
+    let op = match row.op {
+        ByteOp::Read => Op::Read,
+        ByteOp::Write => Op::Write,
+    };
+    let kind = match row.kind {
+        ByteKind::Source => Kind::Source,
+        ByteKind::Spool => Kind::Spool,
+        ByteKind::Manifest => Kind::Manifest,
+        ByteKind::Geometry => Kind::Geometry,
+        ByteKind::Attributes => Kind::Attributes,
+    };
+    (op, kind, row.bytes)
 }
 
 /// Where the pictures are, how noisy, what it took.
