@@ -118,6 +118,32 @@ pub fn furnace() -> Description {
     }
 }
 
+/// What lights the floor of [`floor`].
+pub enum Lamp {
+    /// A parallelogram from a corner along two edges, front below.
+    Rectangle([[f64; 3]; 3]),
+    /// A sphere.
+    Sphere([f64; 3], f64),
+    /// The sky alone.
+    Sky,
+}
+
+/// A floor of albedo one half at y = 0, 40 wide, in many triangles, under a lamp of radiance 1.
+pub fn floor(lamp: &Lamp) -> Description {
+    let half = material("half", Bsdf::Diffuse { reflectance: [0.5; 3] });
+    let black = material("black", Bsdf::Diffuse { reflectance: [0.0; 3] });
+    let mut shapes = vec![shape("floor", sheet([-20.0, 0.0, -20.0], [0.0, 0.0, 40.0], [40.0, 0.0, 0.0], 24), 0, None)];
+    match *lamp {
+        Lamp::Rectangle([c, a, b]) => shapes.push(shape("lamp", sheet(c, a, b, 3), 1, Some([1.0; 3]))),
+        Lamp::Sphere(center, radius) => {
+            shapes.push(shape("lamp", Geometry::Sphere { center, radius }, 1, Some([1.0; 3])));
+        }
+        Lamp::Sky => {}
+    }
+    let environment = matches!(lamp, Lamp::Sky).then_some([1.0; 3]);
+    Description { shapes, materials: vec![half, black], environment, ..cornell() }
+}
+
 /// Prepares a description, cut into splits, into memory.
 pub fn prepared(description: &Description, splits: u32, overlap_reduction: bool) -> PreparedScene {
     let objects = Arc::new(MemoryObjects::default());
