@@ -13,6 +13,8 @@ pub struct Status {
     pub rays: RayCounts,
     /// Camera samples started by committed tasks.
     pub samples: u64,
+    /// What of `rays` (and of the samples, its camera rays) earlier runs made: not in `elapsed`.
+    pub taken_over: RayCounts,
     /// Camera samples that there will be, unless a target error or a time limit ends the job before.
     pub samples_total: u64,
     /// Rays that wait in groups.

@@ -41,6 +41,16 @@ pub enum ChainError {
         /// Name of the newest.
         newest: String,
     },
+    /// There are records, and every one of them is broken.
+    #[error(
+        "{store}: none of its {records} round record(s) can be read: restore them from a copy, or delete the job to start again"
+    )]
+    Unreadable {
+        /// Where.
+        store: String,
+        /// How many.
+        records: usize,
+    },
 }
 
 /// The newest complete chain: the one that reaches the highest place; of several, the one whose last name is least.

@@ -176,7 +176,9 @@ impl Task<'_, '_> {
         let mut none = CameraFeed::new(shared.frame, Vec::new());
         let mut missed = Outcome::default();
         self.inputs(|t, flights| {
-            queues.route(shared, flights)?;
+            for ray in queues.route(shared, flights)? {
+                miss(&context, ray, &mut missed, t.film);
+            }
             let mut made: Vec<PathRay> = Vec::new();
             loop {
                 while queues.len() < limit {
@@ -331,20 +333,26 @@ impl Queues {
         self.len -= flights.len();
         Some((split, flights))
     }
-    /// Rays from elsewhere, which wait for the cell that they were sent to, or for their hit's attributes.
-    fn route(&mut self, shared: &Shared, mut flights: Flights) -> Result<(), JobError> {
+    /// Rays from elsewhere, which wait for the cell that they were sent to, or for their hit's attributes. Returns those that hit
+    /// nothing: a reduce step of another strategy, which an earlier run left, was to say so.
+    fn route(&mut self, shared: &Shared, mut flights: Flights) -> Result<Vec<PathRay>, JobError> {
         let owner = |visit: Visit, decided: u32| match visit.progress.0.checked_sub(1) {
             Some(cell) => shared.scene.grid.owners(cell).get(usize::from(visit.owner)).copied(),
             None => Some(decided),
         };
         let lost = || JobError::Internal("a ray waits for an owner that is none".into());
+        let mut missed = Vec::new();
         for flight in flights.paths.drain(..) {
+            if flight.visit == Visit::DECIDED && !flight.candidate.is_hit() {
+                missed.push(flight.ray);
+                continue;
+            }
             self.path(owner(flight.visit, flight.candidate.split).ok_or_else(lost)?, flight)?;
         }
         for flight in flights.shadows.drain(..) {
             self.shadow(owner(flight.visit, u32::MAX).filter(|&s| s != u32::MAX).ok_or_else(lost)?, flight)?;
         }
-        Ok(())
+        Ok(missed)
     }
 }
 

@@ -29,6 +29,7 @@ use crate::job::{Image, JobError, JobSettings, PreparedScene, Progress, Sampling
 use crate::ledger::{Ledger, Snapshot, TaskId};
 use crate::plan::cost::Traffic;
 use crate::plan::rate::Rate;
+use crate::report::RayCounts;
 use crate::store::Spilling;
 use crate::task::camera::tiles;
 
@@ -91,7 +92,7 @@ fn begin(shared: &Shared, image: &str, sampling: &Sampling) -> Result<Start, Job
     let (nodes, size, tiles) = (&shared.nodes, shared.frame.size, tiles(shared.frame));
     let Some(commits) = &shared.settings.commits else {
         let (ledger, film) = (Ledger::new(image, tiles), FilmPart::new(size));
-        return Ok(Start { ledger, film, owner: None, reused: 0, redone: 0 });
+        return Ok(Start { ledger, film, settled: None, owner: None, reused: 0, redone: 0 });
     };
     let owner = nodes.wait(Ownership::take(nodes.store().as_ref(), commits.takeover))?;
     let resume = || {
@@ -110,7 +111,14 @@ fn begin(shared: &Shared, image: &str, sampling: &Sampling) -> Result<Start, Job
         Ok(resumed)
     };
     match resume() {
-        Ok(r) => Ok(Start { ledger: r.ledger, film: r.film, owner: Some(owner), reused: r.reused, redone: r.lost }),
+        Ok(r) => Ok(Start {
+            ledger: r.ledger,
+            film: r.film,
+            settled: r.settled,
+            owner: Some(owner),
+            reused: r.reused,
+            redone: r.lost,
+        }),
         Err(e) => {
             give_back(nodes, Some(&owner));
             Err(e)
@@ -139,6 +147,7 @@ fn image_name(scene: &PreparedScene, frame: &Frame) -> Result<String, JobError> 
 struct Start {
     ledger: Ledger,
     film: FilmPart,
+    settled: Option<(Snapshot, FilmPart)>,
     owner: Option<Ownership>,
     reused: u64,
     redone: u64,
@@ -203,6 +212,8 @@ struct Driver<'s, 'a> {
     superfluous: [Objects; 2],
     old_records: [Vec<String>; 2],
     rate: Rate,
+    /// Rays of earlier runs.
+    taken_over: RayCounts,
     start: Instant,
     begun: bool,
     rounds: u64,
@@ -234,7 +245,10 @@ impl<'s, 'a> Driver<'s, 'a> {
             shared,
             gate,
             queued: begin.ledger.done().complete(),
-            settled: (Ledger::new("", tiles(shared.frame)).snapshot(None), FilmPart::new(shared.frame.size)),
+            settled: begin.settled.unwrap_or_else(|| {
+                (Ledger::new("", tiles(shared.frame)).snapshot(None), FilmPart::new(shared.frame.size))
+            }),
+            taken_over: begin.ledger.rays(),
             session: begin.owner.as_ref().map_or_else(|| "job".to_owned(), |o| o.session().to_owned()),
             ledger: begin.ledger,
             film: begin.film,

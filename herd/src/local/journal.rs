@@ -6,12 +6,13 @@ use bytes::Bytes;
 use rayherd_render::film::FilmPart;
 
 use super::nodes::Nodes;
+use super::owner::Ownership;
 use crate::job::JobError;
-use crate::ledger::{Chain, FilmRef, Ledger, Record, newest};
+use crate::ledger::{Chain, ChainError, FilmRef, Ledger, Record, Snapshot, newest};
 use crate::report::{Kind as ByteKind, Op, Place, Stage};
 use crate::store::{BlockStore, StoreError};
 use crate::task::codec;
-use crate::wire::envelope::{Compress, Kind, open, seal};
+use crate::wire::envelope::{Compress, Kind, WireError, open, seal};
 
 const RECORDS: &str = "records/";
 /// Largest record that is read: a snapshot of a large job holds a line for each group and tile.
@@ -25,6 +26,8 @@ pub struct Resumed {
     pub ledger: Ledger,
     /// Sum of all committed film parts.
     pub film: FilmPart,
+    /// The last state without rays on their way, if any; rays that are lost later lead back to it.
+    pub settled: Option<(Snapshot, FilmPart)>,
     /// Commits taken over.
     pub reused: u64,
     /// Commits whose outputs are lost: to be computed again.
@@ -47,13 +50,19 @@ pub fn write(nodes: &Nodes, record: &Record) -> Result<String, JobError> {
 }
 
 /// All whole records of a store. Those that are corrupt are named and left out.
+///
+/// # Errors
+/// A record is whole but not for this program (another version), or there are records and none of them is whole: what they say must not be
+/// taken for nothing.
 pub async fn read(store: &dyn BlockStore) -> Result<BTreeMap<String, Record>, JobError> {
     let mut records = BTreeMap::new();
+    let mut broken = 0;
     for (key, _) in store.list(RECORDS).await? {
         let body = match store.get(&key).await {
             Ok(body) => body,
             Err(e @ (StoreError::NotFound { .. } | StoreError::Corrupt { .. })) => {
                 tracing::warn!("{e}");
+                broken += 1;
                 continue;
             }
             Err(e) => return Err(e.into()),
@@ -62,19 +71,26 @@ pub async fn read(store: &dyn BlockStore) -> Result<BTreeMap<String, Record>, Jo
             Ok((name, record)) => {
                 records.insert(name, record);
             }
-            Err(message) => tracing::warn!("{}: {key} is corrupt and left out: {message}", store.describe()),
+            Err(WireError::Corrupt(message)) => {
+                tracing::warn!("{}: {key} is corrupt and left out: {message}", store.describe());
+                broken += 1;
+            }
+            Err(source) => return Err(JobError::Wire { key: format!("{}: {key}", store.describe()), source }),
         }
+    }
+    if records.is_empty() && broken > 0 {
+        return Err(ChainError::Unreadable { store: store.describe(), records: broken }.into());
     }
     Ok(records)
 }
 
-fn record(key: &str, body: &Bytes) -> Result<(String, Record), String> {
-    let json = open(Kind::RoundRecord, body, RECORD_LIMIT).map_err(|e| e.to_string())?;
+fn record(key: &str, body: &Bytes) -> Result<(String, Record), WireError> {
+    let json = open(Kind::RoundRecord, body, RECORD_LIMIT)?;
     let name = blake3::hash(body).to_hex().to_string();
     if !key.ends_with(&name) {
-        return Err("its name is not its hash".into());
+        return Err(WireError::corrupt("its name is not its hash"));
     }
-    Ok((name, serde_json::from_slice(&json).map_err(|e| e.to_string())?))
+    Ok((name, serde_json::from_slice(&json).map_err(|e| WireError::corrupt(e.to_string()))?))
 }
 
 /// The state to go on from.
@@ -113,7 +129,7 @@ pub fn resume(nodes: &Nodes, image: &str, tiles: u32, size: [u32; 2]) -> Result<
         lost = Some(e);
     }
     let reused = ledger.commits();
-    let Some(why) = lost else { return Ok(Resumed { ledger, film, reused, lost: 0 }) };
+    let Some(why) = lost else { return Ok(Resumed { ledger, film, settled, reused, lost: 0 }) };
     if !matches!(why, JobError::Lost { .. }) {
         return Err(why);
     }
@@ -125,7 +141,8 @@ pub fn resume(nodes: &Nodes, image: &str, tiles: u32, size: [u32; 2]) -> Result<
     let record = ledger.record_of(snapshot);
     let name = write(nodes, &record)?;
     ledger.go_back(&record, name)?;
-    Ok(Resumed { ledger, film, reused: kept, lost: reused.saturating_sub(kept) })
+    let settled = Some((ledger.snapshot(None), film.clone()));
+    Ok(Resumed { ledger, film, settled, reused: kept, lost: reused.saturating_sub(kept) })
 }
 
 /// Whether each group that waits has a whole copy.
@@ -142,15 +159,16 @@ fn merge(nodes: &Nodes, film: &mut FilmPart, part: &FilmRef, size: [u32; 2]) -> 
     Ok(film.merge(&part)?)
 }
 
-/// Stores a whole film.
-pub fn store_film(nodes: &Nodes, film: &FilmPart, key: &str) -> Result<Option<FilmRef>, JobError> {
+/// Stores a whole film under `prefix` and its hash: whoever names it means these bytes, whatever is stored later.
+pub fn store_film(nodes: &Nodes, film: &FilmPart, prefix: &str) -> Result<Option<FilmRef>, JobError> {
     if film.touched() == 0 && film.rejected().count == 0 {
         return Ok(None);
     }
     let body = codec::encode_film(film);
     let bytes = body.len() as u64;
-    let holders = nodes.put(0, ByteKind::Film, key, body)?;
-    Ok(Some(FilmRef { key: key.to_owned(), bytes, holders }))
+    let key = format!("{prefix}-{}", &blake3::hash(&body).to_hex()[..16]);
+    let holders = nodes.put(0, ByteKind::Film, &key, body)?;
+    Ok(Some(FilmRef { key, bytes, holders }))
 }
 
 /// What a collection deleted.
@@ -172,11 +190,19 @@ pub async fn collect(store: &dyn BlockStore) -> Result<Collected, JobError> {
     if super::owner::is_owned(store).await? {
         return Err(JobError::Owned(format!("{}: a job is writing to it: wait for its end", store.describe())));
     }
+    // nobody may begin to write between reading the records and deleting
+    let owner = Ownership::take(store, false).await?;
+    let collected = collect_owned(store).await;
+    owner.give_back(store).await?;
+    collected
+}
+
+async fn collect_owned(store: &dyn BlockStore) -> Result<Collected, JobError> {
     let records = read(store).await?;
     let image = records.values().next().map(|r| r.image.clone()).unwrap_or_default();
     let Chain { records, .. } = newest(&image, records)?;
     let tiles_of = |r: &Record| {
-        let taken = r.took.camera.iter().map(|u| u.tile + 1).max();
+        let taken = r.took.camera.iter().map(|u| u.tile.saturating_add(1)).max();
         r.snapshot.as_ref().map(|s| s.done.tiles()).max(taken).unwrap_or(0)
     };
     let mut ledger = Ledger::new(&image, records.iter().map(|r| tiles_of(&r.1)).max().unwrap_or(0));

@@ -2,6 +2,8 @@
 
 pub mod attempt;
 mod cameras;
+#[cfg(test)]
+mod closed_forms;
 mod disks;
 mod driver;
 pub mod faults;

@@ -20,7 +20,8 @@ const BEAT: Duration = Duration::from_secs(10);
 pub struct Owner {
     /// Names one opening of the store.
     pub session: String,
-    /// Identity of the running machine: changes when it starts again.
+    /// Within what process numbers mean something: the running machine (changes when it starts again) and its process namespace
+    /// (containers of one machine count their processes apart).
     pub boot: String,
     /// Process number.
     pub pid: u32,
@@ -39,7 +40,11 @@ pub struct Ownership {
 impl Owner {
     /// This process, now.
     pub fn this_process() -> Owner {
-        let boot = read_to_string("/proc/sys/kernel/random/boot_id").unwrap_or_default().trim().to_owned();
+        let machine = read_to_string("/proc/sys/kernel/random/boot_id").unwrap_or_default();
+        let boot = match (machine.trim(), std::fs::read_link("/proc/self/ns/pid")) {
+            ("", _) | (_, Err(_)) => String::new(),
+            (machine, Ok(namespace)) => format!("{machine} {}", namespace.display()),
+        };
         let pid = std::process::id();
         let nanos = SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |d| d.as_nanos());
         // several jobs may run in one process
@@ -85,6 +90,8 @@ impl Ownership {
         }
         let ownership = Ownership { own, last: Instant::now() };
         ownership.write(store).await?;
+        // of two that begin together the later one stays
+        ownership.check(store).await?;
         Ok(ownership)
     }
 
@@ -118,7 +125,11 @@ impl Ownership {
             Some(other) if other.session != self.own.session => {
                 Err(JobError::Owned(format!("{} was taken over by process {}", store.describe(), other.pid)))
             }
-            _ => Ok(()),
+            Some(_) => Ok(()),
+            None => Err(JobError::Owned(format!(
+                "{} was taken over by a process that has ended since: run again with --resume",
+                store.describe()
+            ))),
         }
     }
     async fn write(&self, store: &dyn BlockStore) -> Result<(), JobError> {
@@ -178,10 +189,14 @@ mod tests {
         assert!(is_owned(&store).await.unwrap());
         third.give_back(&store).await.unwrap();
         assert!(!is_owned(&store).await.unwrap());
-        // on another machine only the heartbeat tells
+        // on another machine, or in another container of this one, only the heartbeat tells
+        let container = Owner::this_process().boot.replace("pid:[", "pid:[1");
         for (age, owned) in [(STALE - 5, true), (STALE + 1, false)] {
             let mut other = Owner::this_process();
-            (other.boot, other.beat) = ("elsewhere".into(), now() - age);
+            assert_ne!(other.boot, container);
+            (other.boot, other.beat) = (if owned { container.clone() } else { "elsewhere".into() }, now() - age);
+            // a number that nobody has here says nothing
+            other.pid = u32::MAX;
             store.put(KEY, serde_json::to_vec(&other).unwrap().into()).await.unwrap();
             assert_eq!(Ownership::take(&store, false).await.is_err(), owned);
         }

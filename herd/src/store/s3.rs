@@ -24,6 +24,14 @@ use super::{BlockStore, StoreError, check_key, check_prefix};
 
 /// Most that S3 takes in one put.
 const LARGEST: u64 = 5 << 30;
+/// To connect.
+const CONNECT: Duration = Duration::from_secs(5);
+/// From the end of a request to the head of its answer.
+const ANSWER_SECONDS: u64 = 30;
+/// Slowest line that is waited for, bytes per second.
+const SLOWEST: u64 = 256 << 10;
+/// Memory taken for an object on a server's word; more as it arrives.
+const FIRST_ALLOCATION: u64 = 64 << 20;
 /// Most keys in one batch delete.
 const BATCH: usize = 1000;
 /// Longest prefix of a store: with our longest key it stays below S3's 1024 bytes.
@@ -266,6 +274,10 @@ impl BlockStore for S3Store {
             return Err(StoreError::Denied { store: self.name.clone(), action: "put", key: key.to_owned(), message });
         }
         let request = self.client.put_object().bucket(&self.bucket).key(self.path(key)).body(ByteStream::from(body));
+        // the answer comes after the whole body: time for a slow line
+        let patience = Duration::from_secs(ANSWER_SECONDS + bytes / SLOWEST);
+        let timeouts = TimeoutConfig::builder().connect_timeout(CONNECT).read_timeout(patience).build();
+        let request = request.customize().config_override(aws_sdk_s3::Config::builder().timeout_config(timeouts));
         request.send().await.map(drop).map_err(|e| self.failure("put", key, bytes, e))
     }
 
@@ -278,7 +290,8 @@ impl BlockStore for S3Store {
         if length > LARGEST {
             return Err(self.broken("get", key, format!("{length} bytes: nothing that large was put")));
         }
-        let mut body = BytesMut::with_capacity(length as usize);
+        // what a server announces is not memory yet
+        let mut body = BytesMut::with_capacity(length.min(FIRST_ALLOCATION) as usize);
         loop {
             match response.body.try_next().await {
                 Ok(Some(part)) if (body.len() + part.len()) as u64 <= length => body.extend_from_slice(&part),
@@ -367,12 +380,9 @@ fn client(settings: &S3Settings) -> Client {
         .response_checksum_validation(ResponseChecksumValidation::WhenRequired)
         // the retrying layer counts and bounds retries, for every store alike
         .retry_config(RetryConfig::disabled())
-        // none for a whole operation, which may move gigabytes: the SDK gives up on stalled streams by itself
+        // to the head of the answer; `put` gives more. None for a whole operation: the SDK gives up on stalled downloads by itself
         .timeout_config(
-            TimeoutConfig::builder()
-                .connect_timeout(Duration::from_secs(5))
-                .read_timeout(Duration::from_secs(30))
-                .build(),
+            TimeoutConfig::builder().connect_timeout(CONNECT).read_timeout(Duration::from_secs(ANSWER_SECONDS)).build(),
         );
     if let Some(endpoint) = &settings.endpoint {
         config = config.endpoint_url(endpoint);

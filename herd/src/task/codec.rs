@@ -8,8 +8,10 @@ use crate::job::PreparedScene;
 use crate::wire::WireError;
 use crate::wire::envelope::{Compress, Kind, open, seal};
 
-/// Largest film that is read, bytes: 96 a pixel at most, so some ten million pixels.
-const FILM_LIMIT: usize = 1 << 30;
+/// Largest film of a picture of this size, bytes: 96 of sums a pixel with their heads, and what comes once.
+fn film_limit([width, height]: [u32; 2]) -> usize {
+    (width as usize * height as usize).saturating_mul(128).saturating_add(1 << 20)
+}
 
 /// Whether rays name only splits and cells that the scene has.
 pub fn check_rays(scene: &PreparedScene, rays: &Flights) -> Result<(), WireError> {
@@ -29,6 +31,6 @@ pub fn encode_film(film: &FilmPart) -> Bytes {
 
 /// A film part from an object.
 pub fn decode_film(size: [u32; 2], body: &[u8]) -> Result<FilmPart, WireError> {
-    let payload = open(Kind::FilmPart, body, FILM_LIMIT)?;
+    let payload = open(Kind::FilmPart, body, film_limit(size))?;
     FilmPart::decode(&payload, size).map_err(|e| WireError::corrupt(e.to_string()))
 }

@@ -33,6 +33,11 @@ impl Driver<'_, '_> {
             // what a task that does not run any more read may be gone by right
             Err(e @ JobError::Lost { .. }) if self.running.contains_key(&task) => return self.go_back(&e),
             Err(JobError::Lost { .. }) => return Ok(()),
+            // another attempt has done the work
+            Err(e) if !self.running.contains_key(&task) && !matches!(e, JobError::Internal(_)) => {
+                tracing::warn!("a second attempt failed after the first was committed: {e}");
+                return Ok(());
+            }
             Err(e) => return Err(e),
         };
         match fate {

@@ -13,6 +13,7 @@ impl Driver<'_, '_> {
         self.progress.status(&Status {
             elapsed: self.start.elapsed(),
             rays,
+            taken_over: self.taken_over,
             samples: rays.camera,
             samples_total: pixels * u64::from(self.sampling.spp),
             waiting: self.ledger.waiting().map(|g| u64::from(g.rays)).sum(),
@@ -22,13 +23,13 @@ impl Driver<'_, '_> {
     }
 
     pub(super) fn finish(mut self) -> Result<JobOutcome, JobError> {
-        if self.owner.is_some() {
-            self.write_snapshot()?;
+        // the picture is whole, and all that it is made of is committed: neither may cost it
+        if self.owner.is_some()
+            && let Err(e) = self.write_snapshot()
+        {
+            tracing::warn!("the store stays as the last commit left it: {e}");
         }
-        if let Some(owner) = &self.owner {
-            let nodes = &self.shared.nodes;
-            nodes.wait(owner.give_back(nodes.store().as_ref()))?;
-        }
+        super::give_back(&self.shared.nodes, self.owner.as_ref());
         let spp = self.ledger.done().complete();
         let [width, height] = self.shared.frame.size;
         let settings = self.shared.settings;

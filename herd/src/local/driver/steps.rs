@@ -38,12 +38,14 @@ impl Driver<'_, '_> {
         let Some(limit) = self.sampling.time_limit else { return end };
         let elapsed = self.start.elapsed().as_secs_f64();
         if !self.begun || elapsed <= 0.0 {
-            return end;
+            // one sample, to learn how long it takes
+            return end.min(self.queued.saturating_add(1)).max(reach);
         }
         let [w, h] = self.shared.frame.size;
-        let made = self.ledger.rays().camera as f64 / (f64::from(w) * f64::from(h));
+        let camera = self.ledger.rays().camera.saturating_sub(self.taken_over.camera);
+        let made = camera as f64 / (f64::from(w) * f64::from(h));
         let samples_left = made / elapsed * (limit - elapsed).max(0.0);
-        end.min(self.queued + (samples_left as u32).max(1)).max(reach)
+        end.min(self.queued.saturating_add((samples_left as u32).max(1))).max(reach)
     }
 
     /// Whether everything queued came to its end.
