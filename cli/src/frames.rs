@@ -64,6 +64,16 @@ pub fn files(job: &RenderJob) -> Vec<PathBuf> {
     cameras.iter().enumerate().map(numbered).collect()
 }
 
+/// Whether each picture has a file of its own: a camera's name may be another's number.
+pub fn check_files(files: &[PathBuf]) -> Result<(), Mistake> {
+    match (1..files.len()).find(|&i| files[..i].contains(&files[i])) {
+        Some(i) => {
+            Err(Mistake(format!("two cameras would write {}: give camera {} another name", files[i].display(), i + 1)))
+        }
+        None => Ok(()),
+    }
+}
+
 /// Samples per pixel: the job's, the scene's, or the default.
 pub fn samples(job: &RenderJob, manifest: &Manifest) -> u32 {
     job.spec.sampling.spp.map(|n| n as u32).or(manifest.defaults.spp).unwrap_or(DEFAULT_SPP)
@@ -163,6 +173,9 @@ mod tests {
         assert_eq!(files(&job), [PathBuf::from("out/x.exr")]);
         job.spec.image.cameras.push(camera(None));
         assert_eq!(files(&job), [PathBuf::from("out/x-front.exr"), PathBuf::from("out/x-0002.exr")]);
+        check_files(&files(&job)).unwrap();
+        job.spec.image.cameras[0].name = Some("0002".into());
+        assert!(check_files(&files(&job)).unwrap_err().to_string().contains("x-0002.exr"));
     }
 
     #[test]

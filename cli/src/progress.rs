@@ -6,6 +6,7 @@ use std::time::{Duration, Instant};
 
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use rayherd_herd::job::{Image, Progress, Status};
+use rayherd_herd::report::RayCounts;
 
 use crate::interrupt;
 use crate::log::bars;
@@ -111,11 +112,12 @@ impl Progress for Display {
 
 fn describe(status: &Status, pixels: u64, target_error: Option<f64>) -> String {
     let seconds = status.elapsed.as_secs_f64();
-    let rays = (status.rays.closest + status.rays.shadow) as f64;
+    let rays = |r: &RayCounts| (r.closest + r.shadow) as f64;
+    let made = rays(&status.rays) - rays(&status.taken_over);
     let spp = |samples: u64| samples as f64 / pixels.max(1) as f64;
     let mut text = format!(
         "{} rays/s  {:.1} of {:.0} spp",
-        si(if seconds > 0.0 { rays / seconds } else { 0.0 }),
+        si(if seconds > 0.0 { made / seconds } else { 0.0 }),
         spp(status.samples),
         spp(status.samples_total)
     );
@@ -130,10 +132,11 @@ fn describe(status: &Status, pixels: u64, target_error: Option<f64>) -> String {
 
 /// Samples come at a steady rate, and the error falls as one over their number; whichever ends the run first.
 fn seconds_left(status: &Status, target_error: Option<f64>) -> Option<f64> {
-    if status.samples == 0 {
+    let made = status.samples.saturating_sub(status.taken_over.camera);
+    if made == 0 {
         return None;
     }
-    let per_sample = status.elapsed.as_secs_f64() / status.samples as f64;
+    let per_sample = status.elapsed.as_secs_f64() / made as f64;
     let left = status.samples_total.saturating_sub(status.samples) as f64;
     let to_target = match (status.error, target_error) {
         (Some(error), Some(target)) => status.samples as f64 * (error / target - 1.0).max(0.0),

@@ -1,6 +1,7 @@
 //! `rayherd gc`: deletes what nothing names.
 
 use std::collections::BTreeSet;
+use std::path::Path;
 use std::process::ExitCode;
 
 use anyhow::Context;
@@ -8,8 +9,10 @@ use clap::Args;
 use rayherd_herd::local::{Collected, collect};
 use rayherd_herd::store::object_key;
 use rayherd_scene::manifest::Manifest;
+use rayherd_scene::objects::ObjectHash;
 
 use super::{print, size};
+use crate::fault::Mistake;
 use crate::store::{JOBS, S3Options, Store};
 
 /// Delete what nothing in a store names: losing attempts, consumed rays, objects of no scene
@@ -29,9 +32,20 @@ pub struct Arguments {
 
 /// Collects jobs first, then objects.
 pub fn run(arguments: &Arguments) -> anyhow::Result<ExitCode> {
-    let store = Store::existing(&arguments.store, &arguments.s3)?;
+    let place = &arguments.store;
+    let nothing = || Mistake(format!("{place} holds nothing of Rayherd's, so nothing of it is deleted: name a store"));
+    // a folder that is no store must not become one by looking
+    let folder = Path::new(place);
+    if !place.starts_with("s3://") && folder.is_dir() && !folder.join("names").is_dir() && !folder.join(JOBS).is_dir() {
+        return Err(nothing().into());
+    }
+    let store = Store::existing(place, &arguments.s3)?;
+    let jobs = jobs(&store)?;
+    if jobs.is_empty() && !store.objects.names()?.iter().any(|n| n.starts_with("scene-")) {
+        return Err(nothing().into());
+    }
     let mut total = Collected::default();
-    for job in jobs(&store)? {
+    for job in jobs {
         let done = store.wait(collect(store.part(&job)?.as_ref())).with_context(|| format!("cannot collect {job}"))?;
         total.objects += done.objects;
         total.bytes += done.bytes;
@@ -40,7 +54,7 @@ pub fn run(arguments: &Arguments) -> anyhow::Result<ExitCode> {
     let named = named(&store)?;
     let mut garbage = Vec::new();
     for (key, bytes) in store.wait(store.blocks.list("objects/"))? {
-        if named.contains(&key) {
+        if named.contains(&key) || !is_object_key(&key) {
             total.kept += 1;
         } else {
             total.objects += 1;
@@ -54,10 +68,19 @@ pub fn run(arguments: &Arguments) -> anyhow::Result<ExitCode> {
     Ok(ExitCode::SUCCESS)
 }
 
-/// Prefixes of the jobs.
+/// Whether a key is one that an object of ours has, by its form: `objects/ab/abcd..`, 64 digits.
+fn is_object_key(key: &str) -> bool {
+    let hex = key.rsplit('/').next().unwrap_or_default();
+    hex.parse().is_ok_and(|hash: ObjectHash| object_key(&hash) == key)
+}
+
+/// Prefixes of the jobs: what has records, or the owner that a first one is about to have.
 fn jobs(store: &Store) -> anyhow::Result<BTreeSet<String>> {
     let keys = store.wait(store.blocks.list(JOBS))?;
-    let job = |key: &str| key[JOBS.len()..].split_once('/').map(|(job, _)| format!("{JOBS}{job}"));
+    let job = |key: &str| {
+        let (job, rest) = key[JOBS.len()..].split_once('/')?;
+        (rest == "owner" || rest.starts_with("records/")).then(|| format!("{JOBS}{job}"))
+    };
     Ok(keys.iter().filter_map(|(key, _)| job(key)).collect())
 }
 

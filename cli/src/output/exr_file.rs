@@ -64,8 +64,18 @@ pub fn read(path: &Path) -> anyhow::Result<Channels> {
     let bytes = fs::read(path).map_err(|e| Mistake(format!("cannot read {}: {e}", path.display())))?;
     let meta = MetaData::read_from_buffered(Cursor::new(&bytes), false)
         .map_err(|e| mistake(format!("is no EXR file: {e}")))?;
-    let claimed = meta.headers.iter().map(|h| h.total_pixel_bytes() as u64).fold(0, u64::saturating_add);
-    if claimed > bytes.len() as u64 * MOST_EXPANSION {
+    let mut claimed = 0u128;
+    for header in &meta.headers {
+        // what the reader takes memory for: every channel over the whole window
+        let pixels = header.layer_size.width() as u128 * header.layer_size.height() as u128;
+        for channel in &header.channels.list {
+            if channel.sampling != exr::math::Vec2(1, 1) {
+                return Err(mistake(format!("has a subsampled channel {}", channel.name)).into());
+            }
+            claimed += pixels * channel.sample_type.bytes_per_sample() as u128;
+        }
+    }
+    if claimed > bytes.len() as u128 * u128::from(MOST_EXPANSION) {
         let message = format!("is damaged: its header claims {claimed} bytes of pixels in a file of {}", bytes.len());
         return Err(mistake(message).into());
     }
