@@ -218,9 +218,21 @@ unsafe fn rounds<I: InstructionSet, const ANY: bool, D: FnMut(usize, &mut State)
             let mut founds = 0;
             for i in 0..leaves {
                 let lane = *leaf.add(i) as usize;
+                if ANY {
+                    // which one does not matter: the ray is done
+                    let state = &mut *states.add(lane);
+                    let is_hit = triangles::<I>(arena, state).0 != 0;
+                    state.prim = if is_hit { 0 } else { state.prim };
+                    state.top = if is_hit { BASE as u32 } else { state.top };
+                    continue;
+                }
                 let f = &mut *found.add(founds);
-                f.lane = lane;
-                founds += usize::from(triangles::<I>(arena, &*states.add(lane), f));
+                let (mask, [t, u, v]) = triangles::<I>(arena, &*states.add(lane));
+                _mm256_store_ps(f.t.as_mut_ptr(), t);
+                _mm256_store_ps(f.u.as_mut_ptr(), u);
+                _mm256_store_ps(f.v.as_mut_ptr(), v);
+                (f.mask, f.lane) = (mask, lane);
+                founds += usize::from(mask != 0);
             }
             for i in 0..founds {
                 let f = &*found.add(i);
@@ -233,9 +245,6 @@ unsafe fn rounds<I: InstructionSet, const ANY: bool, D: FnMut(usize, &mut State)
                     let k = mask.trailing_zeros() as usize;
                     mask &= mask - 1;
                     accept(forest, state, f.t[k], [f.u[k], f.v[k]], *indices.add(k), reference, k as u32);
-                }
-                if ANY {
-                    state.top = BASE as u32;
                 }
             }
 
@@ -345,12 +354,13 @@ unsafe fn boxes<I: InstructionSet>(node: *const u8, state: &State) -> (u32, __m2
     }
 }
 
-/// Tests the triangles of the leaf that a ray is at, as [`super::triangle::intersect`] does: whether there are hits.
+/// Tests the triangles of the leaf that a ray is at, as [`super::triangle::intersect`] does: mask of hits; t and the barycentrics of
+/// the second and third vertex.
 ///
 /// # Safety
 /// The ray's current reference is a leaf in `arena`; features of `I` are enabled.
 #[inline(always)]
-unsafe fn triangles<I: InstructionSet>(arena: *const u8, state: &State, found: &mut Found) -> bool {
+unsafe fn triangles<I: InstructionSet>(arena: *const u8, state: &State) -> (u32, [__m256; 3]) {
     // SAFETY: rows of n values lie in the leaf; eight are read of each, at most 28 bytes past the leaf's end.
     unsafe {
         let leaf = arena.add(offset(state.current)).cast::<f32>();
@@ -393,11 +403,7 @@ unsafe fn triangles<I: InstructionSet>(arena: *const u8, state: &State, found: &
         let [bu, bv, bw] = barycentrics;
         let t = _mm256_mul_ps(_mm256_fmadd_ps(bu, az, _mm256_fmadd_ps(bv, bz, _mm256_mul_ps(bw, cz))), sz);
         let hits = inside & I::compare::<_CMP_LT_OQ>(all(state.tmin), t) & I::compare::<_CMP_LE_OQ>(t, all(state.tmax));
-        _mm256_store_ps(found.t.as_mut_ptr(), t);
-        _mm256_store_ps(found.u.as_mut_ptr(), bv);
-        _mm256_store_ps(found.v.as_mut_ptr(), bw);
-        found.mask = hits;
-        hits != 0
+        (hits, [t, bv, bw])
     }
 }
 
