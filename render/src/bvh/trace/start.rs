@@ -78,7 +78,7 @@ pub(super) unsafe fn start(state: &mut State, ray: &Ray, largest: f32, root: u32
         let inverse_z = _mm_shuffle_ps::<0b10_10_10_10>(along(inverse), along(inverse));
         let shear = _mm_mul_ps(along(d), inverse_z);
         _mm_store_ps(state.origin.as_mut_ptr(), along(o));
-        _mm_store_ps(state.shear.as_mut_ptr(), _mm_insert_ps::<0b00_10_1000>(shear, inverse_z));
+        _mm_store_ps(state.shear.as_mut_ptr(), _mm_insert_ps::<0b0010_1000>(shear, inverse_z));
         // the maximum is its second operand for zeros of any sign
         let tmin = _mm_max_ps(limits, _mm_setzero_ps());
         let axes = _mm_blend_ps::<8>(_mm_castsi128_ps(axes), _mm_shuffle_ps::<0b10_10_10_10>(tmin, tmin));
