@@ -41,6 +41,26 @@ pub struct Metadata {
 
 /// What is wanted of a render. What is left out is taken from the scene file, or else from the defaults named here.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[cfg_attr(feature = "kube", derive(kube::CustomResource))]
+#[cfg_attr(
+    feature = "kube",
+    kube(
+        group = "rayherd.io",
+        version = "v1alpha1",
+        kind = "RenderJob",
+        root = "RenderJobObject",
+        namespaced,
+        status = "crate::resource::RenderJobStatus",
+        shortname = "rj",
+        derive = "PartialEq",
+        printcolumn(name = "Phase", type_ = "string", json_path = ".status.phase"),
+        printcolumn(name = "Progress", type_ = "string", json_path = ".status.progress"),
+        printcolumn(name = "Error", type_ = "string", json_path = ".status.relMse"),
+        printcolumn(name = "Remote", type_ = "string", json_path = ".status.remoteReadRatio"),
+        printcolumn(name = "Workers", type_ = "string", json_path = ".status.workers"),
+        printcolumn(name = "Age", type_ = "date", json_path = ".metadata.creationTimestamp")
+    )
+)]
 #[serde(rename_all = "camelCase", deny_unknown_fields)]
 pub struct RenderJobSpec {
     /// The scene and how it is imported.
@@ -79,6 +99,22 @@ pub struct RenderJobSpec {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[schemars(range(min = 0.01, max = 3600.0))]
     pub task_seconds: Option<f64>,
+    /// Where a cluster keeps scenes, rays and pictures. A local run has no use for it.
+    #[serde(default)]
+    pub storage: StorageSpec,
+}
+
+/// Where a cluster keeps scenes, rays and pictures.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "camelCase", deny_unknown_fields)]
+pub struct StorageSpec {
+    /// Name of a profile that whoever runs the operator has set up; `default` by default.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub profile: Option<String>,
+    /// Secret in the job's namespace that holds `AWS_ACCESS_KEY_ID` and `AWS_SECRET_ACCESS_KEY`; `rayherd-storage` by
+    /// default.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub secret: Option<String>,
 }
 
 /// The scene and how it is imported.

@@ -7,6 +7,8 @@
 pub mod byte_size;
 pub mod image_size;
 pub mod job;
+#[cfg(feature = "kube")]
+pub mod resource;
 pub mod strategy;
 pub mod validate;
 
@@ -14,7 +16,7 @@ pub use byte_size::ByteSize;
 pub use image_size::ImageSize;
 pub use job::{
     API_VERSION, CameraSpec, ImageSpec, KIND, LightSpec, Metadata, RenderJob, RenderJobSpec, SamplingSpec, SceneSpec,
-    WorkersSpec,
+    StorageSpec, WorkersSpec,
 };
 pub use strategy::Strategy;
 pub use validate::{Problem, validate};

@@ -2,26 +2,13 @@
 
 use std::path::{Path, PathBuf};
 
-use anyhow::Context;
 use rayherd_api::{CameraSpec, RenderJob};
-use rayherd_render::camera::Camera;
-use rayherd_render::filter::Filter;
+use rayherd_herd::job::spec;
 use rayherd_render::frame::Frame;
-use rayherd_scene::import::CameraView;
 use rayherd_scene::manifest::Manifest;
-use serde_json::{Map, Value, json};
 
 use crate::fault::Mistake;
 use crate::source;
-
-/// What Mitsuba renders when nothing is said.
-const DEFAULT_SIZE: [u32; 2] = [768, 576];
-/// Enough for every scene that ends paths by Russian roulette.
-const DEFAULT_MAX_DEPTH: u32 = 65;
-/// Mitsuba's.
-const DEFAULT_RR_DEPTH: u32 = 5;
-/// Enough to see what is what.
-const DEFAULT_SPP: u32 = 64;
 
 /// One picture of a job.
 pub struct Shot {
@@ -74,49 +61,11 @@ pub fn check_files(files: &[PathBuf]) -> Result<(), Mistake> {
     }
 }
 
-/// Samples per pixel: the job's, the scene's, or the default.
-pub fn samples(job: &RenderJob, manifest: &Manifest) -> u32 {
-    job.spec.sampling.spp.map(|n| n as u32).or(manifest.defaults.spp).unwrap_or(DEFAULT_SPP)
-}
-
 /// The frame that a camera sees; the scene's own without one.
 pub fn frame(job: &RenderJob, manifest: &Manifest, camera: Option<&CameraSpec>) -> anyhow::Result<Frame> {
-    let (image, sampling, defaults) = (&job.spec.image, &job.spec.sampling, &manifest.defaults);
-    let camera = match camera {
-        Some(c) => {
-            let view = CameraView { origin: c.origin, target: c.target, up: c.up, fov: c.fov };
-            view.camera().map_err(|e| Mistake(e.to_string()))?
-        }
-        None => {
-            defaults.camera.clone().ok_or_else(|| Mistake("the scene has no camera: give one by --camera".into()))?
-        }
-    };
-    let size = image.size.map(|s| [s.width(), s.height()]).or(defaults.size).unwrap_or(DEFAULT_SIZE);
-    let camera = Camera::new(&camera.to_world.0, camera.fov_x, size, manifest.offset)
-        .map_err(|e| Mistake(format!("camera: {e}")))?;
-    let given = |v: Option<i32>| v.map(|n| n as u32);
-    let frame = Frame {
-        camera,
-        size,
-        filter: defaults.filter.unwrap_or(Filter::Box),
-        seed: sampling.seed.map_or(0, |n| n as u64),
-        max_depth: given(sampling.max_depth).or(defaults.max_depth).unwrap_or(DEFAULT_MAX_DEPTH),
-        rr_depth: given(sampling.rr_depth).or(defaults.rr_depth).unwrap_or(DEFAULT_RR_DEPTH),
-        split: given(sampling.split).unwrap_or(1),
-    };
-    frame.check().map_err(|e| Mistake(e.to_string()))?;
-    check_memory(size)?;
+    let frame = spec::frame(&job.spec, manifest, camera)?;
+    check_memory(frame.size)?;
     Ok(frame)
-}
-
-/// What defines an image, for the header of its file: the scene's content, the frame, the number of samples.
-pub fn definition(manifest: &Manifest, frame: &Frame, spp: u32) -> anyhow::Result<Map<String, Value>> {
-    let frame = serde_json::to_value(frame).context("cannot write the frame down")?;
-    let value = json!({ "scene": manifest.content, "frame": frame, "spp": spp });
-    match value {
-        Value::Object(map) => Ok(map),
-        _ => anyhow::bail!("the definition of an image is an object"),
-    }
 }
 
 /// Bytes per pixel: the film's two halves of three 16-byte sums, once for the whole and once in tasks, and the picture.

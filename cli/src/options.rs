@@ -8,7 +8,7 @@ use std::str::FromStr;
 
 use clap::Args;
 use rayherd_api::{ByteSize, LightSpec, RenderJob, RenderJobSpec};
-use rayherd_scene::import::{ImportOptions, Light, parse_albedo, parse_define, parse_radiance};
+use rayherd_scene::import::{Light, parse_albedo, parse_define, parse_radiance};
 
 use crate::fault::Mistake;
 
@@ -119,28 +119,6 @@ pub fn numbers<T: FromStr>(text: &str) -> Result<Vec<T>, String> {
     text.split(',').map(|n| n.trim().parse().map_err(|_| format!("{n:?} is no number"))).collect()
 }
 
-/// What importing is told, by a job that was checked.
-pub fn import_options(spec: &RenderJobSpec) -> ImportOptions {
-    let scene = &spec.scene;
-    let light = |l: &LightSpec| Light { origin: l.origin, target: l.target, size: l.size, radiance: rgb(&l.radiance) };
-    ImportOptions {
-        substitute: scene.substitute,
-        defines: scene.define.iter().map(|(name, value)| (name.clone(), value.clone())).collect(),
-        size: spec.image.size.map(|s| [s.width(), s.height()]),
-        iso: scene.iso,
-        albedo: scene.albedo.as_deref().map(rgb),
-        // a camera that was asked for belongs to a frame, not to the scene: it must not prepare it anew
-        camera: None,
-        lights: scene.lights.iter().map(light).collect(),
-        sky: scene.sky.as_deref().map(rgb),
-    }
-}
-
-/// One number for all channels, or three.
-fn rgb(numbers: &[f64]) -> [f32; 3] {
-    std::array::from_fn(|c| numbers[if numbers.len() == 3 { c } else { 0 }] as f32)
-}
-
 fn light_spec(l: &Light) -> LightSpec {
     let radiance = l.radiance.map(f64::from).to_vec();
     LightSpec { origin: l.origin, target: l.target, size: l.size, radiance }
@@ -148,6 +126,8 @@ fn light_spec(l: &Light) -> LightSpec {
 
 #[cfg(test)]
 mod tests {
+    use rayherd_herd::job::spec::import_options;
+
     use super::*;
 
     #[test]

@@ -4,13 +4,13 @@ use std::path::{Path, PathBuf};
 
 use anyhow::Context;
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
-use rayherd_api::{RenderJobSpec, Strategy};
+use rayherd_api::RenderJobSpec;
+use rayherd_herd::job::spec::{import_options, prepare_settings};
 use rayherd_scene::import::{DescriptionSource, StreamOptions, import};
 use rayherd_scene::objects::ObjectStore;
-use rayherd_scene::prepare::{Cut, PrepareProgress, PrepareSettings, Prepared, SpoolSettings, Stage, prepare};
+use rayherd_scene::prepare::{PrepareProgress, Prepared, SpoolSettings, Stage, prepare};
 
 use crate::log::bars;
-use crate::options::import_options;
 
 /// Imports and prepares the scene of a job that was checked.
 pub fn open(spec: &RenderJobSpec, objects: &dyn ObjectStore) -> anyhow::Result<Prepared> {
@@ -24,20 +24,6 @@ pub fn open(spec: &RenderJobSpec, objects: &dyn ObjectStore) -> anyhow::Result<P
         prepare(&description, &source, &prepare_settings(spec), &SpoolSettings::default(), objects, &progress);
     progress.finish();
     prepared.with_context(|| format!("cannot prepare {}", spec.scene.source))
-}
-
-/// What preparing is told.
-fn prepare_settings(spec: &RenderJobSpec) -> PrepareSettings {
-    let defaults = PrepareSettings::default();
-    let cut = match (spec.block_size, spec.splits) {
-        (Some(size), _) => Cut::BlockSize(size.bytes()),
-        (None, Some(n)) => Cut::Splits(u32::try_from(n).unwrap_or(u32::MAX)),
-        (None, None) => defaults.cut,
-    };
-    let overlap_threshold = spec.overlap_threshold.unwrap_or(defaults.overlap_threshold);
-    // the paper's other two systems have none
-    let overlap_reduction = matches!(spec.strategy, Strategy::SchedulingGridOverlapReduced | Strategy::Auto);
-    PrepareSettings { cut, overlap_reduction, overlap_threshold, ..defaults }
 }
 
 /// Shows the stages of preparing on a terminal.

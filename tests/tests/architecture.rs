@@ -61,12 +61,14 @@ fn dependencies(folder: &str) -> Vec<String> {
 
 #[test]
 fn dependencies_point_down() {
-    let allowed: [(&str, &[&str]); 5] = [
+    let allowed: [(&str, &[&str]); 7] = [
         ("render", &[]),
         ("scene", &["render"]),
         ("api", &[]),
         ("herd", &["render", "scene", "api"]),
         ("cli", &["render", "scene", "api", "herd"]),
+        ("worker", &["herd"]),
+        ("operator", &["scene", "api", "herd"]),
     ];
     for (folder, may) in allowed {
         for name in dependencies(folder) {
@@ -113,8 +115,33 @@ fn only_the_s3_store_knows_s3() {
     let mut files = sources("herd/src");
     files.extend(sources("cli/src"));
     files.extend(sources("api/src"));
+    files.extend(sources("worker/src"));
+    files.extend(sources("operator/src"));
     files.retain(|(p, _)| p != "herd/src/store/s3.rs" && !p.starts_with("herd/src/store/s3/"));
     assert_eq!(offending(&files, &["aws_sdk", "aws_smithy", "aws_config"]), Vec::<String>::new());
+}
+
+#[test]
+fn only_the_operator_knows_kubernetes() {
+    let mut files = Vec::new();
+    for folder in ["render/src", "scene/src", "api/src", "herd/src", "cli/src", "worker/src"] {
+        files.extend(sources(folder));
+    }
+    // the resource's definition: types without a client
+    files.retain(|(p, _)| p != "api/src/resource.rs" && p != "api/src/job.rs");
+    assert_eq!(offending(&files, &["kube::", "k8s_openapi"]), Vec::<String>::new());
+    assert_eq!(offending(&sources("api/src"), &["kube::Client", "kube::Api", "kube_client"]), Vec::<String>::new());
+}
+
+/// Rays and film go from worker to store to worker.
+#[test]
+fn the_operator_reads_no_rays_and_no_film() {
+    let words = ["ray_group", "FilmPart", "decode_film", "codec", "attempt::run"];
+    let files: Vec<_> = sources("operator/src").into_iter().chain(sources("herd/src/remote")).collect();
+    let of_workers =
+        |p: &str| p.ends_with("remote/station.rs") || p.ends_with("remote/tests.rs") || p.ends_with("remote/fleet.rs");
+    let files: Vec<_> = files.into_iter().filter(|(p, _)| !of_workers(p)).collect();
+    assert_eq!(offending(&files, &words), Vec::<String>::new());
 }
 
 #[test]
@@ -122,7 +149,7 @@ fn unsafe_stays_in_named_modules() {
     let named =
         ["render/src/bvh/arena.rs", "render/src/bvh/trace/", "render/src/path/wide.rs", "scene/src/import/spill.rs"];
     let mut files = Vec::new();
-    for folder in ["render/src", "scene/src", "api/src", "herd/src", "cli/src"] {
+    for folder in ["render/src", "scene/src", "api/src", "herd/src", "cli/src", "worker/src", "operator/src"] {
         files.extend(sources(folder));
     }
     files.retain(|(p, _)| !named.iter().any(|n| p.starts_with(n)));

@@ -7,11 +7,12 @@ use std::process::ExitCode;
 
 use clap::Args;
 use rayherd_api::{RenderJob, RenderJobSpec};
+use rayherd_herd::job::spec::import_options;
 use rayherd_scene::description::{Bsdf, Description, Geometry, MeshFormat};
 use rayherd_scene::import::{ImportOptions, Survey, import};
 
 use super::{print, size};
-use crate::options::{self, SceneOptions, import_options};
+use crate::options::{self, SceneOptions};
 
 /// Say what a scene holds, what of it is not supported and what is missing; nothing is prepared or rendered
 ///

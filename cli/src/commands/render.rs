@@ -8,8 +8,10 @@ use std::sync::Arc;
 use anyhow::Context;
 use clap::Args;
 use rayherd_api::{RenderJob, RenderJobSpec};
+use rayherd_herd::job::spec;
 use rayherd_herd::job::{Commits, JobSettings, PreparedScene, Sampling};
 use rayherd_herd::local::{JobOutcome, render_local};
+use rayherd_herd::picture;
 use rayherd_herd::report::{Kind, Op, Report};
 use rayherd_scene::objects::ObjectStore;
 use rayherd_scene::prepare::{ByteKind, ByteOp, ByteRow, Prepared};
@@ -21,7 +23,7 @@ use crate::image_options::ImageOptions;
 use crate::interrupt::{self, Heeding};
 use crate::job_file::read_job;
 use crate::options::{self, CutOptions, SceneOptions, set};
-use crate::output::{exr_file, png_file, replace};
+use crate::output::{png_file, replace};
 use crate::progress::{Display, si};
 use crate::run_options::RunOptions;
 use crate::source;
@@ -129,7 +131,7 @@ pub fn run(arguments: &Arguments) -> anyhow::Result<ExitCode> {
     let shots = frames::shots(&job, &prepared.manifest)?;
     let scene = PreparedScene::open(prepared.manifest.clone(), objects)?;
     let sampling = Sampling {
-        spp: frames::samples(&job, &prepared.manifest),
+        spp: spec::samples(&job.spec, &prepared.manifest),
         target_error: job.spec.sampling.target_error,
         time_limit: job.spec.sampling.time_limit,
     };
@@ -220,8 +222,8 @@ fn render(
 }
 
 fn save(scene: &PreparedScene, shot: &Shot, outcome: &JobOutcome, exposure: f64) -> anyhow::Result<()> {
-    let definition = frames::definition(&scene.manifest, &shot.frame, outcome.spp)?;
-    replace::replace_or_keep(&shot.exr, &exr_file::encode(&outcome.image, &definition)?)?;
+    let definition = spec::definition(&scene.manifest, &shot.frame, outcome.spp)?;
+    replace::replace_or_keep(&shot.exr, &picture::encode(&outcome.image, &definition)?)?;
     replace::replace_or_keep(&shot.png(), &png_file::encode(&outcome.image, exposure)?)
 }
 

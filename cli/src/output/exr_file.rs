@@ -1,48 +1,13 @@
-//! OpenEXR: linear 32-bit float RGB out, any flat scanline or tiled picture in.
+//! OpenEXR in: any flat scanline or tiled picture. Out: [`rayherd_herd::picture`].
 
 use std::collections::BTreeMap;
 use std::fs;
 use std::io::Cursor;
 use std::path::Path;
 
-use anyhow::anyhow;
-use exr::prelude::{
-    Encoding, FlatImage, FlatSamples, Image, ImageAttributes, IntegerBounds, Layer, LayerAttributes, MetaData,
-    ReadChannels, ReadLayers, SpecificChannels, Text, WritableImage,
-};
-use rayherd_herd::job::Image as Picture;
-use serde_json::{Map, Value};
+use exr::prelude::{FlatImage, FlatSamples, MetaData, ReadChannels, ReadLayers};
 
 use crate::fault::Mistake;
-
-/// The attribute that holds what defines the image, as one JSON object.
-///
-/// One, because the exr crate writes attributes in the order of a hash map, which differs from run to run.
-pub const ATTRIBUTE: &str = "rayherd";
-
-/// Encodes `picture` with `definition` in its header. The same arguments give the same bytes: compression and order of
-/// lines are fixed, and nothing tells of time, host or threads.
-pub fn encode(picture: &Picture, definition: &Map<String, Value>) -> anyhow::Result<Vec<u8>> {
-    let width = picture.width as usize;
-    let channels = SpecificChannels::rgb(|at: exr::math::Vec2<usize>| {
-        let [r, g, b] = picture.pixels[at.y() * width + at.x()];
-        (r, g, b)
-    });
-    let size = (width, picture.height as usize);
-    let encoding = Encoding { line_order: exr::meta::attribute::LineOrder::Increasing, ..Encoding::SMALL_LOSSLESS };
-    let mut attributes = LayerAttributes::default();
-    let text = Value::Object(definition.clone()).to_string();
-    let text = Text::new_or_none(text).ok_or_else(|| anyhow!("the image's definition does not fit an EXR header"))?;
-    attributes.other.insert(Text::from(ATTRIBUTE), exr::meta::attribute::AttributeValue::Text(text));
-    attributes.software_name = Some(Text::from(concat!("rayherd ", env!("CARGO_PKG_VERSION"))));
-    let image = Image {
-        attributes: ImageAttributes::new(IntegerBounds::from_dimensions(size)),
-        layer_data: Layer::new(size, attributes, encoding, channels),
-    };
-    let mut bytes = Cursor::new(Vec::new());
-    image.write().to_buffered(&mut bytes).map_err(|e| anyhow!("cannot encode an EXR: {e}"))?;
-    Ok(bytes.into_inner())
-}
 
 /// The channels of an EXR file by name (`LAYER.NAME` when there are layers), as f32, rows from the top.
 pub struct Channels {
@@ -120,6 +85,11 @@ fn collect(image: FlatImage) -> Result<Channels, String> {
 
 #[cfg(test)]
 mod tests {
+    use exr::prelude::Text;
+    use rayherd_herd::job::Image as Picture;
+    use rayherd_herd::picture::{ATTRIBUTE, encode};
+    use serde_json::{Map, Value};
+
     use super::*;
 
     fn picture() -> Picture {

@@ -4,6 +4,7 @@ mod error;
 mod progress;
 mod scene;
 mod settings;
+pub mod spec;
 
 pub use error::JobError;
 pub use progress::{Image, Progress, Silent, Status};

@@ -7,6 +7,7 @@ use rayherd_render::frame::Frame;
 use rayherd_render::path::{Context, Outcome, PathRay, Surface, Surfaces, shade};
 use rayherd_render::ray::{Hit, PrimId};
 use rayherd_scene::grid::SplitSet;
+use serde::{Deserialize, Serialize};
 
 use super::nodes::Nodes;
 use crate::flight::{Flights, PathFlight, ShadowFlight, Visit};
@@ -22,7 +23,7 @@ use crate::wave::CameraUnit;
 use crate::wire::ray_group;
 
 /// What an attempt works on.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Attempt {
     /// Name of its objects.
     pub name: String,

@@ -1,7 +1,7 @@
 //! An executor with virtual nodes, in one process.
 
 pub mod attempt;
-mod cameras;
+pub(crate) mod cameras;
 #[cfg(test)]
 mod closed_forms;
 mod disks;
@@ -10,10 +10,10 @@ pub mod faults;
 pub mod journal;
 pub mod nodes;
 pub mod owner;
-mod slots;
+pub mod slots;
 #[cfg(test)]
 mod tests;
-mod usage;
+pub mod usage;
 
 pub use driver::render_local;
 use rayherd_render::film::FilmPart;
@@ -37,7 +37,12 @@ pub struct JobOutcome {
 }
 
 /// Checks what can be checked before anything is read.
-fn check(scene: &PreparedScene, frame: &Frame, sampling: &Sampling, settings: &JobSettings) -> Result<(), JobError> {
+pub(crate) fn check(
+    scene: &PreparedScene,
+    frame: &Frame,
+    sampling: &Sampling,
+    settings: &JobSettings,
+) -> Result<(), JobError> {
     frame.check()?;
     let refuse = |message: String| Err(JobError::Settings(message));
     if sampling.spp == 0 || sampling.spp > crate::wave::MAX_SPP {

@@ -18,14 +18,38 @@ use crate::resident::{Blocks, Memory};
 use crate::store::{BlockStore, StoreError};
 use crate::wire::WireError;
 
+/// Nodes that get a copy of each split: a function of the scene and their number, so that all who ask agree.
+pub fn placement(scene: &PreparedScene, nodes: u32, replicas: u32) -> Vec<Vec<u32>> {
+    let order = scene.owning_order();
+    let sizes: Vec<u64> = order.iter().map(|&s| scene.split_bytes(s)).collect();
+    // what nobody ever reads lies on the first nodes
+    let mut holders = vec![(0..replicas).collect::<Vec<u32>>(); scene.splits() as usize];
+    for (&split, on) in order.iter().zip(place::holders(&sizes, nodes, replicas)) {
+        holders[split as usize] = on;
+    }
+    holders
+}
+
+/// Reads blocks of the scene from the stores of real nodes.
+pub trait Fetch: Send + Sync {
+    /// An object of a split, and whether it lay on the node that asks.
+    ///
+    /// # Errors
+    /// When no copy can be had.
+    fn fetch(&self, split: u32, object: &ObjectRef) -> Result<(Vec<u8>, Place), JobError>;
+}
+
 /// All nodes.
 pub struct Nodes<'a> {
     scene: &'a PreparedScene,
     store: Arc<dyn BlockStore>,
     runtime: Runtime,
     replicas: u32,
+    /// Nodes that hold rays and film: the first ones.
+    keepers: u32,
+    fetch: Option<Box<dyn Fetch + 'a>>,
     memories: Vec<Memory>,
-    /// None for a single node.
+    /// None for a single node, and for real ones.
     disks: Option<Disks>,
     /// Nodes that hold a split, by split number.
     holders: RwLock<Vec<Vec<u32>>>,
@@ -41,22 +65,32 @@ struct Counts {
 impl<'a> Nodes<'a> {
     /// Nodes with blocks placed on them along a curve through space.
     pub fn new(scene: &'a PreparedScene, settings: &JobSettings, store: Arc<dyn BlockStore>) -> Result<Self, JobError> {
+        let mut nodes = Self::real(scene, settings, store, settings.nodes.len() as u32, None)?;
+        if settings.nodes.len() > 1 {
+            nodes.disks = Some(Disks::new(settings.nodes.len(), nodes.replicas as usize)?);
+        }
+        Ok(nodes)
+    }
+
+    /// Nodes of which the first `keepers` hold rays and film, in stores of their own below `nodes/N/`; blocks come from `fetch`.
+    pub fn real(
+        scene: &'a PreparedScene,
+        settings: &JobSettings,
+        store: Arc<dyn BlockStore>,
+        keepers: u32,
+        fetch: Option<Box<dyn Fetch + 'a>>,
+    ) -> Result<Self, JobError> {
         let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(1).enable_all().build();
         let runtime = runtime.map_err(|e| JobError::Internal(format!("no runtime for input and output: {e}")))?;
-        let order = scene.owning_order();
-        let sizes: Vec<u64> = order.iter().map(|&s| scene.split_bytes(s)).collect();
         let count = settings.nodes.len() as u32;
         let replicas = settings.replicas.clamp(1, count);
-        // what nobody ever reads lies on the first nodes
-        let mut holders = vec![(0..replicas).collect::<Vec<u32>>(); scene.splits() as usize];
-        for (&split, on) in order.iter().zip(place::holders(&sizes, count, settings.replicas)) {
-            holders[split as usize] = on;
-        }
+        let holders = placement(scene, count, replicas);
         let memory = settings.memory_per_node.unwrap_or(u64::MAX);
         let nodes = settings.nodes.iter().map(|n| NodeReport { slots: n.slots, ..NodeReport::default() }).collect();
-        let disks = (count > 1).then(|| Disks::new(count as usize, replicas as usize)).transpose()?;
         Ok(Nodes {
-            disks,
+            disks: None,
+            keepers: keepers.max(1),
+            fetch,
             scene,
             store,
             runtime,
@@ -102,9 +136,17 @@ impl<'a> Nodes<'a> {
             }
         }
     }
+    /// Counts bytes that a node moved, as it has counted them itself.
+    pub fn count_all(&self, node: u32, bytes: &Bytes) {
+        bytes.rows().iter().for_each(|r| self.count(r.stage, r.op, r.kind, node, r.place, r.bytes));
+    }
     /// Counts the time of a task.
     pub fn busy(&self, node: u32, seconds: f64) {
         self.counts.lock().unwrap_or_else(PoisonError::into_inner).nodes[node as usize].busy += seconds;
+    }
+    /// The bytes counted since this was asked last.
+    pub fn take_bytes(&self) -> Bytes {
+        std::mem::take(&mut self.counts.lock().unwrap_or_else(PoisonError::into_inner).bytes)
     }
     /// All counts.
     pub fn report(&self) -> (Bytes, Vec<NodeReport>) {
@@ -118,20 +160,34 @@ impl<'a> Nodes<'a> {
 
     /// Stores an object on a node and on as many others as there are copies to be; the nodes that hold it.
     pub fn put(&self, node: u32, kind: Kind, name: &str, body: Body) -> Result<Vec<u32>, JobError> {
-        let count = self.memories.len() as u32;
-        let holders: Vec<u32> = (0..self.replicas).map(|k| (node + k) % count).collect();
-        for &holder in &holders {
-            self.wait(self.store.put(&disk_key(holder, name), body.clone()))?;
-            let place = if holder == node { Place::Local } else { Place::Remote };
-            self.count(Stage::Trace, Op::Write, kind, node, place, body.len() as u64);
+        let mut holders = Vec::new();
+        let mut error = None;
+        // one that does not take it is passed over as long as there are others
+        for holder in (0..self.keepers).map(|k| (node + k) % self.keepers) {
+            match self.wait(self.store.put(&disk_key(holder, name), body.clone())) {
+                Ok(()) => {
+                    let place = if holder == node { Place::Local } else { Place::Remote };
+                    self.count(Stage::Trace, Op::Write, kind, node, place, body.len() as u64);
+                    holders.push(holder);
+                }
+                Err(e @ (StoreError::Unavailable { .. } | StoreError::Full { .. })) if self.keepers > 1 => {
+                    tracing::warn!("{e}");
+                    error = Some(e);
+                }
+                Err(e) => return Err(e.into()),
+            }
+            if holders.len() as u32 >= self.replicas.min(self.keepers) {
+                return Ok(holders);
+            }
         }
-        Ok(holders)
+        let few = || JobError::Internal(format!("{name} has {} copies", holders.len()));
+        Err(error.map_or_else(few, JobError::from))
     }
 
     /// Reads an object, from the node itself if it holds a copy; a copy that is missing or broken is passed over.
     ///
     /// # Errors
-    /// [`JobError::Lost`] when no copy is whole.
+    /// [`JobError::Lost`] when no copy is whole and every holder answers.
     pub fn get<T>(
         &self,
         node: u32,
@@ -143,6 +199,7 @@ impl<'a> Nodes<'a> {
         let own = holders.iter().filter(|&&h| h == node);
         let others = holders.iter().filter(|&&h| h != node);
         let mut why = "no node holds it".to_owned();
+        let mut silent = None;
         for &holder in own.chain(others) {
             match self.wait(self.store.get(&disk_key(holder, name))) {
                 Ok(body) => {
@@ -155,8 +212,13 @@ impl<'a> Nodes<'a> {
                     tracing::warn!("{name}: {why}");
                 }
                 Err(e @ (StoreError::NotFound { .. } | StoreError::Corrupt { .. })) => why = e.to_string(),
+                // another holder may answer
+                Err(e @ StoreError::Unavailable { .. }) => silent = Some(e),
                 Err(e) => return Err(e.into()),
             }
+        }
+        if let Some(e) = silent {
+            return Err(e.into());
         }
         Err(JobError::Lost { name: name.to_owned(), why })
     }
@@ -247,6 +309,11 @@ pub struct NodeBlocks<'n, 'a> {
 impl NodeBlocks<'_, '_> {
     fn read(&self, split: u32, kind: Kind, object: &ObjectRef) -> Result<Vec<u8>, JobError> {
         let (nodes, node) = (self.nodes, self.node);
+        if let Some(fetch) = &nodes.fetch {
+            let (bytes, place) = fetch.fetch(split, object)?;
+            nodes.count(Stage::Trace, Op::Read, kind, node, place, bytes.len() as u64);
+            return Ok(bytes);
+        }
         let Some(disks) = &nodes.disks else {
             let bytes = nodes.scene.objects.get(object)?;
             nodes.count(Stage::Trace, Op::Read, kind, node, Place::Local, bytes.len() as u64);

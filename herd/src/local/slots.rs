@@ -56,6 +56,10 @@ impl StopFlag {
     pub fn new(batches: Option<u32>) -> Self {
         StopFlag { stop: Arc::default(), changed: Arc::default(), left: batches.map(|n| Arc::new(AtomicU32::new(n))) }
     }
+    /// Whether it was set.
+    pub fn is_set(&self) -> bool {
+        self.stop.load(Ordering::Relaxed)
+    }
     /// The attempt ends at its next batch.
     pub fn set(&self) {
         let _held = self.changed.0.lock().unwrap_or_else(PoisonError::into_inner);

@@ -18,6 +18,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::ops::Range;
 
 pub use rayherd_api::Strategy;
+use serde::{Deserialize, Serialize};
 
 /// A split, as the planner sees it.
 #[derive(Clone, Debug)]
@@ -89,7 +90,7 @@ impl View<'_> {
 }
 
 /// The data that a task works with.
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub enum Set {
     /// These splits, all at once.
     Resident(Vec<u32>),

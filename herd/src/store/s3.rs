@@ -154,15 +154,20 @@ pub struct S3Store {
 }
 
 impl S3Store {
-    /// Makes the client and looks whether the bucket answers.
-    pub async fn connect(settings: S3Settings) -> Result<Self, StoreError> {
+    /// Makes the client, for a server that may not answer yet.
+    pub fn new(settings: S3Settings) -> Result<Self, StoreError> {
         settings.check()?;
-        let store = S3Store {
+        Ok(S3Store {
             client: client(&settings),
             name: settings.url(),
             prefix: if settings.prefix.is_empty() { String::new() } else { settings.prefix + "/" },
             bucket: settings.bucket,
-        };
+        })
+    }
+
+    /// Makes the client and looks whether the bucket answers.
+    pub async fn connect(settings: S3Settings) -> Result<Self, StoreError> {
+        let store = Self::new(settings)?;
         // listing, not heading the bucket: the answer to HEAD has no body that says why not
         let probe = store.client.list_objects_v2().bucket(&store.bucket).prefix(&store.prefix).max_keys(1).send();
         probe.await.map_err(|e| store.failure("open", "", 0, e))?;

@@ -1,0 +1,88 @@
+//! What the loop over rounds needs of its surroundings: where tasks run, where their film is summed, who keeps the ledger.
+
+use std::time::Duration;
+
+use crate::job::JobError;
+use crate::ledger::{FilmRef, TaskId};
+use crate::local::attempt::{Attempt, Made};
+use crate::local::slots::StopFlag;
+use crate::report::Bytes;
+
+/// An attempt to start.
+pub struct Launch {
+    /// Of which task.
+    pub task: TaskId,
+    /// Which attempt of it.
+    pub number: u32,
+    /// What to do, and on which node.
+    pub attempt: Attempt,
+    /// Set when the attempt need not go on.
+    pub stop: StopFlag,
+}
+
+/// An attempt that came to its end.
+pub struct Finished {
+    /// Of which task.
+    pub task: TaskId,
+    /// Which attempt of it.
+    pub number: u32,
+    /// What it made. [`JobError::Stopped`] when it ended, or its node did, without a result.
+    pub result: Result<Made, JobError>,
+    /// CPU-seconds that it took.
+    pub cpu: f64,
+    /// Bytes that it moved, unless the job's own nodes have counted them.
+    pub bytes: Bytes,
+}
+
+/// Where tasks run.
+pub trait Executor {
+    /// Whether the node takes tasks now.
+    fn is_up(&self, node: u32) -> bool;
+    /// Nodes next to a copy of each split, where the executor knows better than the job's own nodes.
+    fn holders(&self) -> Option<Vec<Vec<u32>>> {
+        None
+    }
+    /// Whether one more attempt would compute at once.
+    fn has_room(&self) -> bool;
+    /// Starts an attempt. It is told of by [`Executor::next`], once.
+    fn launch(&self, launch: Launch);
+    /// The next attempt that ended; none after `wait`.
+    ///
+    /// # Errors
+    /// When nothing can run any more.
+    fn next(&self, wait: Duration) -> Result<Option<Finished>, JobError>;
+}
+
+/// The sum of all committed film parts, and a state of it to go back to.
+pub trait FilmSum {
+    /// Adds the part of a commit.
+    ///
+    /// # Errors
+    /// When it is of another size.
+    fn add(&mut self, made: &Made) -> Result<(), JobError>;
+    /// Keeps the sum as it is, to go back to.
+    fn settle(&mut self);
+    /// Goes back to what was kept.
+    fn go_back(&mut self);
+    /// Stores the sum as one object of this name; none when it is empty.
+    ///
+    /// # Errors
+    /// When it cannot be stored.
+    fn store(&mut self, name: &str) -> Result<Option<FilmRef>, JobError>;
+    /// Estimated relMSE of so many samples per pixel, if there are two.
+    ///
+    /// # Errors
+    /// When the sum cannot be had.
+    fn rel_mse(&mut self, spp: u32) -> Result<Option<f64>, JobError>;
+    /// Whether a stored object is still needed.
+    fn needs(&self, name: &str) -> bool;
+}
+
+/// Where it is kept which record is the newest: the one place that must be consistent.
+pub trait Pointer: Send + Sync {
+    /// Moves the pointer to a record that is durable.
+    ///
+    /// # Errors
+    /// [`JobError::Owned`] when somebody else moved it.
+    fn move_to(&self, sequence: u64, name: &str) -> Result<(), JobError>;
+}

@@ -1,0 +1,416 @@
+//! The workers of a job, as its operator sees them: who is there, who does what, what is to be done next.
+//!
+//! A worker that is not heard of for [`SILENCE`], or that starts again, has lost what it was doing. What it reports later
+//! is refused: its id is known no more.
+
+use std::collections::{BTreeMap, BTreeSet, VecDeque};
+use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
+use std::time::{Duration, Instant};
+
+use rayherd_render::film::FilmPart;
+use tokio::sync::Notify;
+
+use super::executor::{Executor, Finished, Launch};
+use super::message::{Answer, Beat, Done, Failure, Poll, Report, Stage, Work, WorkerId};
+use crate::job::JobError;
+use crate::ledger::TaskId;
+use crate::local::attempt::Made;
+use crate::local::slots::StopFlag;
+use crate::report::Bytes;
+
+/// A worker that is silent for so long is gone. It beats each second.
+pub const SILENCE: Duration = Duration::from_secs(10);
+/// So many failures one after the other, that may pass by themselves, are too many.
+const MOST_FAILURES: u32 = 30;
+
+/// The workers of one job.
+pub struct Fleet {
+    state: Mutex<State>,
+    /// Something for whoever runs the job.
+    told: Condvar,
+    /// Something for workers that wait for work.
+    wanted: Notify,
+}
+
+#[derive(Default)]
+struct State {
+    epoch: String,
+    next: u64,
+    size: [u32; 2],
+    stage: Option<Stage>,
+    /// Stores that hold each split.
+    placement: Vec<Vec<u32>>,
+    workers: Vec<Option<Worker>>,
+    /// For any worker.
+    common: VecDeque<(u64, Work)>,
+    doing: BTreeMap<String, Doing>,
+    finished: VecDeque<Finished>,
+    answers: BTreeMap<u64, Result<Done, Failure>>,
+    failures: u32,
+    bytes: Bytes,
+    cpu: f64,
+    first_attempt: Option<Instant>,
+    over: bool,
+    cancelled: Option<String>,
+}
+
+struct Worker {
+    session: String,
+    home: Option<u32>,
+    seen: Instant,
+    ready: VecDeque<(TaskId, u32, Work, StopFlag)>,
+    /// It has the current stage open.
+    open: bool,
+}
+
+struct Doing {
+    worker: u32,
+    what: What,
+}
+
+enum What {
+    Attempt { task: TaskId, number: u32, stop: StopFlag },
+    Call { call: u64, work: Work },
+}
+
+/// What a fleet has done so far, for the status of its job.
+#[derive(Clone, Debug, Default)]
+pub struct Tally {
+    /// Workers that are there.
+    pub ready: u32,
+    /// Bytes moved.
+    pub bytes: Bytes,
+    /// CPU-seconds of all work.
+    pub cpu: f64,
+    /// When the first attempt was handed out.
+    pub first_attempt: Option<Instant>,
+}
+
+impl Fleet {
+    /// A fleet of so many workers, none of them there yet. `epoch` names this run of the operator: ids begin with it, so that
+    /// reports of work that another run gave out are not mistaken.
+    pub fn new(workers: u32, epoch: &str) -> Self {
+        let workers = (0..workers).map(|_| None).collect();
+        let state = State { epoch: epoch.to_owned(), workers, ..State::default() };
+        Fleet { state: Mutex::new(state), told: Condvar::new(), wanted: Notify::new() }
+    }
+
+    fn lock(&self) -> MutexGuard<'_, State> {
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Another frame begins: workers open its stage.
+    pub fn open(&self, stage: Stage, placement: Vec<Vec<u32>>) {
+        let mut state = self.lock();
+        state.placement = placement;
+        state.size = stage.frame.size;
+        state.stage = Some(stage);
+        state.workers.iter_mut().flatten().for_each(|w| w.open = false);
+        self.wanted.notify_waiters();
+    }
+    /// The job is over: workers end.
+    pub fn end(&self) {
+        self.lock().over = true;
+        self.wanted.notify_waiters();
+    }
+    /// The job is to end now, with this message.
+    pub fn cancel(&self, why: &str) {
+        self.lock().cancelled = Some(why.to_owned());
+        self.told.notify_all();
+    }
+    /// What was done so far.
+    pub fn tally(&self) -> Tally {
+        let state = self.lock();
+        let ready = state.workers.iter().flatten().filter(|w| w.seen.elapsed() < SILENCE).count() as u32;
+        Tally { ready, bytes: state.bytes.clone(), cpu: state.cpu, first_attempt: state.first_attempt }
+    }
+    /// The store on the node of each worker, where known.
+    pub fn homes(&self) -> Vec<Option<u32>> {
+        self.lock().workers.iter().map(|w| w.as_ref().and_then(|w| w.home)).collect()
+    }
+    /// A pod is known to be gone: its work goes back at once. Another session's is left alone.
+    pub fn gone(&self, worker: &WorkerId) {
+        let mut state = self.lock();
+        let number = worker.number as usize;
+        if state.workers.get(number).and_then(|w| w.as_ref()).is_some_and(|w| w.session == worker.session) {
+            state.leave(worker.number);
+            self.tell();
+        }
+    }
+
+    fn tell(&self) {
+        self.told.notify_all();
+        self.wanted.notify_waiters();
+    }
+
+    /// Answers a worker that asks for work; after `patience` with [`Answer::Wait`].
+    ///
+    /// # Errors
+    /// When there is no worker of this number.
+    pub async fn poll(&self, poll: &Poll, patience: Duration) -> Result<Answer, Unknown> {
+        let end = tokio::time::Instant::now() + patience;
+        loop {
+            let wanted = self.wanted.notified();
+            tokio::pin!(wanted);
+            wanted.as_mut().enable();
+            let answer = self.answer(poll)?;
+            if answer != Answer::Wait || tokio::time::timeout_at(end, wanted).await.is_err() {
+                return Ok(answer);
+            }
+        }
+    }
+
+    /// Answers a worker that asks for work, at once.
+    ///
+    /// # Errors
+    /// When there is no worker of this number.
+    pub fn answer(&self, poll: &Poll) -> Result<Answer, Unknown> {
+        let mut state = self.lock();
+        let newcomer = state.meet(&poll.worker, poll.home)?;
+        if newcomer {
+            self.told.notify_all();
+        }
+        if state.over {
+            return Ok(Answer::Over);
+        }
+        if state.stage.as_ref().map(|s| &s.id) != poll.stage.as_ref() {
+            return Ok(Answer::Open { stage: state.stage.clone().map(Box::new) });
+        }
+        let id = format!("{}-{}", state.epoch, state.next);
+        let in_stage = poll.stage.is_some();
+        let worker = state.workers[poll.worker.number as usize].as_mut().ok_or(Unknown)?;
+        worker.open |= in_stage;
+        let (what, work) = if let Some((call, work)) = state.common.pop_front() {
+            (What::Call { call, work: work.clone() }, work)
+        } else if !poll.clerk
+            && let Some((task, number, work, stop)) =
+                state.workers[poll.worker.number as usize].as_mut().and_then(|w| w.ready.pop_front())
+        {
+            state.first_attempt.get_or_insert_with(Instant::now);
+            (What::Attempt { task, number, stop }, work)
+        } else {
+            return Ok(Answer::Wait);
+        };
+        state.next += 1;
+        state.doing.insert(id.clone(), Doing { worker: poll.worker.number, what });
+        Ok(Answer::Work { id, work: Box::new(work) })
+    }
+
+    /// Takes a report; false when nobody waits for it (any more): the work is garbage.
+    ///
+    /// # Errors
+    /// When there is no worker of this number.
+    pub fn report(&self, report: Report) -> Result<bool, Unknown> {
+        let mut state = self.lock();
+        state.meet(&report.worker, None)?;
+        if state.doing.get(&report.id).is_none_or(|d| d.worker != report.worker.number) {
+            return Ok(false);
+        }
+        let Some(doing) = state.doing.remove(&report.id) else { return Ok(false) };
+        let mut bytes = Bytes::default();
+        report.bytes.iter().for_each(|r| bytes.add(r.stage, r.op, r.kind, r.place, r.bytes));
+        state.bytes.merge(&bytes);
+        state.cpu += report.cpu;
+        match (doing.what, report.result) {
+            (What::Attempt { task, number, .. }, result) => {
+                let result = state.judge(result);
+                state.finished.push_back(Finished { task, number, result, cpu: report.cpu, bytes });
+            }
+            // another worker may do it
+            (What::Call { call, work }, Err(Failure::Stopped)) => state.common.push_front((call, work)),
+            (What::Call { call, work }, Err(Failure::ForNow { message })) if state.failures < MOST_FAILURES => {
+                tracing::warn!("{message}; trying again");
+                state.failures += 1;
+                state.common.push_back((call, work));
+            }
+            (What::Call { call, .. }, result) => {
+                if result.is_ok() {
+                    state.failures = 0;
+                }
+                state.answers.insert(call, result);
+            }
+        }
+        drop(state);
+        self.tell();
+        Ok(true)
+    }
+
+    /// Takes a sign of life; the ids of work that need not go on.
+    ///
+    /// # Errors
+    /// When there is no worker of this number.
+    pub fn beat(&self, beat: &Beat) -> Result<Vec<String>, Unknown> {
+        let mut state = self.lock();
+        state.meet(&beat.worker, None)?;
+        let superfluous = |id: &&String| match state.doing.get(*id).map(|d| &d.what) {
+            None => true,
+            Some(What::Attempt { stop, .. }) => stop.is_set(),
+            Some(What::Call { .. }) => false,
+        };
+        Ok(beat.running.iter().filter(superfluous).cloned().collect())
+    }
+
+    /// Has some worker do something, and waits for it.
+    ///
+    /// # Errors
+    /// When it cannot be done.
+    pub fn call(&self, work: Work) -> Result<Done, JobError> {
+        let mut state = self.lock();
+        let call = state.next;
+        state.next += 1;
+        state.common.push_back((call, work));
+        self.wanted.notify_waiters();
+        loop {
+            if let Some(result) = state.answers.remove(&call) {
+                return result.map_err(|f| match f {
+                    Failure::Lost { name, why } => JobError::Lost { name, why },
+                    Failure::Stopped => JobError::Stopped,
+                    Failure::ForNow { message } | Failure::ForGood { message } => JobError::Settings(message),
+                });
+            }
+            state.check()?;
+            if state.sweep() {
+                self.wanted.notify_waiters();
+            }
+            state = self.wait(state, Duration::from_millis(200));
+        }
+    }
+
+    /// Waits until all workers have the stage open, or so long.
+    ///
+    /// # Errors
+    /// When the job was cancelled meanwhile.
+    pub fn gather(&self, patience: Duration) -> Result<(), JobError> {
+        let end = Instant::now() + patience;
+        let mut state = self.lock();
+        while Instant::now() < end && !state.workers.iter().all(|w| w.as_ref().is_some_and(|w| w.open)) {
+            state.check()?;
+            state = self.wait(state, Duration::from_millis(50));
+        }
+        Ok(())
+    }
+
+    fn wait<'s>(&self, state: MutexGuard<'s, State>, time: Duration) -> MutexGuard<'s, State> {
+        self.told.wait_timeout(state, time).unwrap_or_else(PoisonError::into_inner).0
+    }
+}
+
+/// There is no worker of this number in the job.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
+#[error("the job has no worker of this number")]
+pub struct Unknown;
+
+impl State {
+    /// Notes that a worker is there; whether it was not before.
+    fn meet(&mut self, worker: &WorkerId, home: Option<u32>) -> Result<bool, Unknown> {
+        let number = worker.number as usize;
+        let known = self.workers.get(number).ok_or(Unknown)?.as_ref();
+        let newcomer = known.is_none_or(|w| w.session != worker.session);
+        if newcomer {
+            self.leave(worker.number);
+            let (session, seen) = (worker.session.clone(), Instant::now());
+            self.workers[number] = Some(Worker { session, home, seen, ready: VecDeque::new(), open: false });
+        }
+        if let Some(w) = &mut self.workers[number] {
+            w.seen = Instant::now();
+            w.home = home.or(w.home);
+        }
+        Ok(newcomer)
+    }
+
+    /// A worker is gone: what it did is lost, what any worker can do is done by another.
+    fn leave(&mut self, number: u32) {
+        let Some(worker) = self.workers[number as usize].take() else { return };
+        for (task, attempt, _, _) in worker.ready {
+            self.lose(task, attempt);
+        }
+        let ids: Vec<String> =
+            self.doing.iter().filter(|(_, d)| d.worker == number).map(|(id, _)| id.clone()).collect();
+        for id in ids {
+            match self.doing.remove(&id).map(|d| d.what) {
+                Some(What::Attempt { task, number, .. }) => self.lose(task, number),
+                Some(What::Call { call, work }) => self.common.push_front((call, work)),
+                None => {}
+            }
+        }
+    }
+
+    fn lose(&mut self, task: TaskId, number: u32) {
+        let (result, bytes) = (Err(JobError::Stopped), Bytes::default());
+        self.finished.push_back(Finished { task, number, result, cpu: 0.0, bytes });
+    }
+
+    /// Lets silent workers go; whether there were any.
+    fn sweep(&mut self) -> bool {
+        let silent = |w: &Option<Worker>| w.as_ref().is_some_and(|w| w.seen.elapsed() >= SILENCE);
+        let gone: BTreeSet<u32> =
+            (0..self.workers.len() as u32).filter(|&n| silent(&self.workers[n as usize])).collect();
+        for &number in &gone {
+            tracing::warn!("worker {number} is silent: what it did is done again");
+            self.leave(number);
+        }
+        !gone.is_empty()
+    }
+
+    fn check(&self) -> Result<(), JobError> {
+        self.cancelled.as_ref().map_or(Ok(()), |why| Err(JobError::Owned(why.clone())))
+    }
+
+    /// What an attempt's result means to the loop over rounds.
+    fn judge(&mut self, result: Result<Done, Failure>) -> Result<Made, JobError> {
+        match result {
+            Ok(Done::Made { outputs, hops }) => {
+                self.failures = 0;
+                Ok(Made { outputs, film: FilmPart::new(self.size), hops })
+            }
+            Ok(_) => Err(JobError::Internal("a worker reports something else than it was to do".into())),
+            Err(Failure::Stopped) => Err(JobError::Stopped),
+            Err(Failure::Lost { name, why }) => Err(JobError::Lost { name, why }),
+            Err(Failure::ForNow { message }) if self.failures < MOST_FAILURES => {
+                tracing::warn!("{message}; trying again");
+                self.failures += 1;
+                Err(JobError::Stopped)
+            }
+            Err(Failure::ForNow { message } | Failure::ForGood { message }) => Err(JobError::Settings(message)),
+        }
+    }
+}
+
+impl Executor for Fleet {
+    fn is_up(&self, node: u32) -> bool {
+        self.lock().workers.get(node as usize).is_some_and(|w| w.as_ref().is_some_and(|w| w.open))
+    }
+    fn holders(&self) -> Option<Vec<Vec<u32>>> {
+        let state = self.lock();
+        let homes: Vec<Option<u32>> = state.workers.iter().map(|w| w.as_ref().and_then(|w| w.home)).collect();
+        let near = |on: &Vec<u32>| {
+            let near = |&w: &u32| homes[w as usize].is_some_and(|home| on.contains(&home));
+            (0..homes.len() as u32).filter(near).collect()
+        };
+        Some(state.placement.iter().map(near).collect())
+    }
+    fn has_room(&self) -> bool {
+        true
+    }
+    fn launch(&self, launch: Launch) {
+        let Launch { task, number, attempt, stop } = launch;
+        let mut state = self.lock();
+        let node = attempt.node as usize;
+        match state.workers.get_mut(node).and_then(|w| w.as_mut()) {
+            Some(worker) => worker.ready.push_back((task, number, Work::Attempt { attempt }, stop)),
+            // it went away since it was planned for
+            None => state.lose(task, number),
+        }
+        drop(state);
+        self.tell();
+    }
+    fn next(&self, wait: Duration) -> Result<Option<Finished>, JobError> {
+        let mut state = self.lock();
+        state.check()?;
+        state.sweep();
+        if state.finished.is_empty() {
+            state = self.wait(state, wait);
+        }
+        Ok(state.finished.pop_front())
+    }
+}

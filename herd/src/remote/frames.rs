@@ -1,0 +1,206 @@
+//! A whole job, as its operator runs it: prepare the scene, then render frame by frame.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use rayherd_api::RenderJobSpec;
+use rayherd_scene::manifest::Manifest;
+use rayherd_scene::objects::{ObjectRef, ObjectStore};
+use tokio::runtime::Handle;
+
+use super::driver::{Driver, Start, image_name};
+use super::executor::Pointer;
+use super::message::{Done, Stage, Work};
+use super::parts::Parts;
+use super::{Depot, Fleet};
+use crate::job::{JobError, JobSettings, NodeSpec, PreparedScene, Progress, Sampling, spec as from_spec};
+use crate::ledger::{FilmRef, Ledger, Snapshot, newest};
+use crate::local::attempt::Shared;
+use crate::local::journal;
+use crate::local::nodes::{Nodes, placement};
+use crate::report;
+use crate::store::SceneObjects;
+use crate::task::camera::tiles;
+
+/// How long the first plan of a frame waits for workers that are not there yet.
+const GATHER: Duration = Duration::from_secs(3);
+
+/// Whoever keeps the state of a job where it outlives the operator.
+pub trait Keeper: Send + Sync {
+    /// The newest record of a frame that counts: its place in the chain and its name.
+    fn newest(&self, frame: u32) -> Option<(u64, String)>;
+    /// Moves the pointer of a frame to a record that is durable.
+    ///
+    /// # Errors
+    /// [`JobError::Owned`] when somebody else moved it.
+    fn move_to(&self, frame: u32, sequence: u64, name: &str) -> Result<(), JobError>;
+    /// The scene is prepared.
+    fn prepared(&self, scene: &ObjectRef, reused: bool);
+    /// Which nodes' stores hold the scene: bytes by store.
+    fn placed(&self, bytes: &[u64]);
+    /// A frame is done.
+    fn done(&self, frame: u32, picture: &[String], report: &report::Report);
+}
+
+/// A job to run.
+pub struct Job<'a> {
+    /// Its checked spec.
+    pub spec: &'a RenderJobSpec,
+    /// Names of the pictures: one for each frame.
+    pub pictures: Vec<String>,
+    /// Where its own objects are in each store.
+    pub prefix: String,
+    /// Names this run of the operator; objects of another run never have its names.
+    pub session: String,
+    /// All stores.
+    pub depot: &'a Depot,
+    /// Its workers.
+    pub fleet: &'a Fleet,
+    /// Slots of each worker.
+    pub slots: Vec<u32>,
+    /// Where input and output runs; not the caller's thread.
+    pub runtime: Handle,
+}
+
+/// Runs a job to its end. Blocks.
+///
+/// # Errors
+/// When it cannot be finished; what was committed stays.
+pub fn run(job: &Job, keeper: &Arc<dyn Keeper>, progress: &dyn Progress) -> Result<(), JobError> {
+    let spec = job.spec;
+    let replicas = spec.replicas.map_or(1, |r| r as u32).clamp(1, job.depot.len());
+    let prepare = Work::Prepare { spec: Box::new(spec.clone()), replicas };
+    let Done::Prepared { scene: reference, reused } = job.fleet.call(prepare)? else {
+        return Err(JobError::Internal("a worker reports something else than it was to do".into()));
+    };
+    keeper.prepared(&reference, reused);
+    let store = Arc::new(job.depot.replicated(replicas)?);
+    let objects: Arc<dyn ObjectStore> = Arc::new(SceneObjects::new(store, job.runtime.clone())?);
+    let scene = PreparedScene::open(Manifest::load(objects.as_ref(), &reference)?, objects)?;
+    let places = placement(&scene, job.depot.len(), replicas);
+    let mut bytes = vec![0; job.depot.len() as usize];
+    for (split, on) in places.iter().enumerate() {
+        on.iter().for_each(|&n| bytes[n as usize] += scene.split_bytes(split as u32));
+    }
+    keeper.placed(&bytes);
+    let sampling = Sampling {
+        spp: from_spec::samples(spec, &scene.manifest),
+        target_error: spec.sampling.target_error,
+        time_limit: spec.sampling.time_limit,
+    };
+    for (number, picture) in job.pictures.iter().enumerate() {
+        let frame = from_spec::frame(spec, &scene.manifest, spec.image.cameras.get(number))?;
+        let number = number as u32;
+        let stage = Stage {
+            id: format!("{}-{number}", job.session),
+            scene: reference,
+            frame,
+            prefix: format!("{}/{number}", job.prefix),
+            strategy: spec.strategy,
+            memory: spec.workers.memory.map(|m| m.bytes()),
+            replicas,
+            buckets: job.slots.iter().sum(),
+        };
+        render(job, keeper, progress, &scene, &stage, &places, &sampling, (number, picture))?;
+    }
+    Ok(())
+}
+
+fn render(
+    job: &Job,
+    keeper: &Arc<dyn Keeper>,
+    progress: &dyn Progress,
+    scene: &PreparedScene,
+    stage: &Stage,
+    places: &[Vec<u32>],
+    sampling: &Sampling,
+    (number, picture): (u32, &str),
+) -> Result<(), JobError> {
+    let defaults = JobSettings::default();
+    let settings = JobSettings {
+        strategy: stage.strategy,
+        nodes: job.slots.iter().map(|&slots| NodeSpec { slots }).collect(),
+        memory_per_node: stage.memory,
+        replicas: stage.replicas,
+        barrier: job.spec.barrier,
+        task_seconds: job.spec.task_seconds.unwrap_or(defaults.task_seconds),
+        ..defaults
+    };
+    crate::local::check(scene, &stage.frame, sampling, &settings)?;
+    let part = Arc::new(job.depot.part(&stage.prefix, stage.replicas)?);
+    let shared = Shared {
+        scene,
+        frame: &stage.frame,
+        settings: &settings,
+        nodes: Nodes::real(scene, &settings, part, job.depot.len(), None)?,
+        store_film: true,
+        buckets: stage.buckets,
+    };
+    let image = image_name(scene, &stage.frame)?;
+    let resumed = resume(&shared.nodes, &image, tiles(&stage.frame), keeper.newest(number))?;
+    let pointer = FramePointer { keeper: keeper.clone(), frame: number };
+    let start = Start {
+        reused: resumed.ledger.commits(),
+        ledger: resumed.ledger,
+        film: Parts::new(job.fleet, resumed.film, resumed.settled.1),
+        settled: resumed.settled.0,
+        pointer: Arc::new(pointer),
+        session: job.session.clone(),
+        redone: 0,
+    };
+    job.fleet.open(stage.clone(), places.to_vec());
+    // the first plan decides who holds what: better with all who are about to come
+    job.fleet.gather(GATHER)?;
+    let mut driver = Driver::new(&shared, start, sampling, progress);
+    if let Err(e) = driver.run(job.fleet) {
+        driver.stop_all();
+        return Err(e);
+    }
+    driver.stop_all();
+    let (film, spp, report) = driver.finish()?;
+    let (.., picture) = film.merge(None, spp, Some(picture.to_owned()))?;
+    keeper.done(number, &picture, &report);
+    Ok(())
+}
+
+struct FramePointer {
+    keeper: Arc<dyn Keeper>,
+    frame: u32,
+}
+
+impl Pointer for FramePointer {
+    fn move_to(&self, sequence: u64, name: &str) -> Result<(), JobError> {
+        self.keeper.move_to(self.frame, sequence, name)
+    }
+}
+
+/// The state to go on from, with film parts by reference.
+struct Resumed {
+    ledger: Ledger,
+    film: Vec<FilmRef>,
+    settled: (Snapshot, Vec<FilmRef>),
+}
+
+/// Follows the chain that ends at the pointer. Records beyond it do not count: whoever wrote them did not move it.
+fn resume(nodes: &Nodes, image: &str, tiles: u32, pointer: Option<(u64, String)>) -> Result<Resumed, JobError> {
+    let mut ledger = Ledger::new(image, tiles);
+    let (mut film, mut settled) = (Vec::new(), (ledger.snapshot(None), Vec::new()));
+    let Some((sequence, name)) = pointer else { return Ok(Resumed { ledger, film, settled }) };
+    let mut records = nodes.wait(journal::read(nodes.store().as_ref()))?;
+    records.retain(|n, r| r.sequence < sequence || *n == name);
+    if !records.contains_key(&name) {
+        let place = nodes.store().describe();
+        return Err(JobError::Lost { name, why: format!("{place} lacks the newest round record") });
+    }
+    for (name, record) in newest(image, records)?.records {
+        if let Some(snapshot) = &record.snapshot {
+            film = snapshot.film.iter().cloned().collect();
+        }
+        film.extend(record.made.film.clone());
+        ledger.replay(&record, name)?;
+        if ledger.is_settled() {
+            settled = (ledger.snapshot(None), film.clone());
+        }
+    }
+    Ok(Resumed { ledger, film, settled })
+}

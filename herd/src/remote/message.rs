@@ -1,0 +1,202 @@
+//! Messages between workers and operator. Small: names, numbers and counts; rays, film and blocks go through the stores.
+
+use rayherd_api::{RenderJobSpec, Strategy};
+use rayherd_render::frame::Frame;
+use rayherd_scene::objects::ObjectRef;
+use serde::{Deserialize, Serialize};
+
+use crate::job::JobError;
+use crate::ledger::{FilmRef, Outputs};
+use crate::local::attempt::Attempt;
+use crate::report::BytesRow;
+
+/// Which worker speaks.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "camelCase")]
+pub struct WorkerId {
+    /// Its number in the job, from 0.
+    pub number: u32,
+    /// Names this start of its process: another session has nothing of what this one held.
+    pub session: String,
+}
+
+/// A worker asks for work.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "camelCase")]
+pub struct Poll {
+    /// Who.
+    pub worker: WorkerId,
+    /// The endpoint on its own node, if there is one.
+    pub home: Option<u32>,
+    /// The stage that it has open.
+    pub stage: Option<String>,
+    /// It takes no attempts: so that film is added up while all slots compute.
+    pub clerk: bool,
+}
+
+/// What it is told.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "camelCase", tag = "answer")]
+pub enum Answer {
+    /// Nothing to do yet: ask again.
+    Wait,
+    /// Something to do in the stage that is open.
+    Work {
+        /// Names this piece of work in the report.
+        id: String,
+        /// What.
+        work: Box<Work>,
+    },
+    /// Another stage is on: open it (none: close this one).
+    Open {
+        /// Which.
+        stage: Option<Box<Stage>>,
+    },
+    /// The job is over: end.
+    Over,
+}
+
+/// One frame that is rendered: all that a worker needs besides the attempts.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "camelCase")]
+pub struct Stage {
+    /// Names it.
+    pub id: String,
+    /// The manifest of the scene.
+    pub scene: ObjectRef,
+    /// The picture.
+    pub frame: Frame,
+    /// Where the frame's objects are in each store, without slashes at its ends.
+    pub prefix: String,
+    /// Which data a task holds.
+    pub strategy: Strategy,
+    /// Scene data that a worker may hold, bytes; no bound if none.
+    pub memory: Option<u64>,
+    /// Copies of each object.
+    pub replicas: u32,
+    /// Buckets of the reduce step.
+    pub buckets: u32,
+}
+
+/// Something to do.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "camelCase", tag = "work")]
+pub enum Work {
+    /// Import and prepare the job's scene, unless it is prepared, and put its blocks where they belong.
+    Prepare {
+        /// The checked job.
+        spec: Box<RenderJobSpec>,
+        /// Copies of each block.
+        replicas: u32,
+    },
+    /// Trace.
+    Attempt {
+        /// What.
+        attempt: Attempt,
+    },
+    /// Add film parts.
+    Merge {
+        /// The sum is stored under this name; not at all without one.
+        name: Option<String>,
+        /// What to add.
+        parts: Vec<FilmRef>,
+        /// Samples per pixel in the sum, for its error and the picture.
+        spp: u32,
+        /// The picture is written under this key of the storage, as OpenEXR.
+        picture: Option<String>,
+    },
+}
+
+/// What a worker did.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "camelCase")]
+pub struct Report {
+    /// Who.
+    pub worker: WorkerId,
+    /// Which piece of work.
+    pub id: String,
+    /// What came out.
+    pub result: Result<Done, Failure>,
+    /// CPU-seconds.
+    pub cpu: f64,
+    /// Bytes moved.
+    pub bytes: Vec<BytesRow>,
+}
+
+/// What came out of a piece of work.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "camelCase", tag = "done")]
+pub enum Done {
+    /// Of preparing.
+    Prepared {
+        /// The manifest.
+        scene: ObjectRef,
+        /// It was there already.
+        reused: bool,
+    },
+    /// Of an attempt.
+    Made {
+        /// To be committed.
+        outputs: Outputs,
+        /// Rays that left the split set.
+        hops: u64,
+    },
+    /// Of a merge.
+    Merged {
+        /// The sum, if it was to be stored and is not empty.
+        film: Option<FilmRef>,
+        /// Estimated relMSE.
+        rel_mse: Option<f64>,
+        /// Where the picture lies, if it was asked for.
+        picture: Vec<String>,
+    },
+}
+
+/// Why a piece of work did not come out.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "camelCase", tag = "failure")]
+pub enum Failure {
+    /// It was given back, or need not go on.
+    Stopped,
+    /// An input is gone with all its copies.
+    Lost {
+        /// Which.
+        name: String,
+        /// How that was found.
+        why: String,
+    },
+    /// May work later or elsewhere.
+    ForNow {
+        /// What went wrong.
+        message: String,
+    },
+    /// Will not work.
+    ForGood {
+        /// What went wrong, and what to do.
+        message: String,
+    },
+}
+
+impl From<&JobError> for Failure {
+    fn from(e: &JobError) -> Self {
+        use crate::store::StoreError;
+        match e {
+            JobError::Stopped => Failure::Stopped,
+            JobError::Lost { name, why } => Failure::Lost { name: name.clone(), why: why.clone() },
+            JobError::Store(StoreError::Unavailable { .. } | StoreError::Full { .. }) | JobError::Object(_) => {
+                Failure::ForNow { message: e.to_string() }
+            }
+            e => Failure::ForGood { message: e.to_string() },
+        }
+    }
+}
+
+/// A sign of life, sent while work runs.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "camelCase")]
+pub struct Beat {
+    /// Who.
+    pub worker: WorkerId,
+    /// What runs.
+    pub running: Vec<String>,
+}

@@ -1,0 +1,24 @@
+//! A job on machines of their own: what operator and worker say to each other, and what each does about it.
+//!
+//! The operator plans and commits; it never reads rays or film. A worker asks for work ([`Poll`]), does it next to its own
+//! store ([`station`]) and reports ids and counts ([`Report`]). [`fleet::Fleet`] is the operator's side: the executor of the
+//! loop over rounds, fed by workers that come and go. How messages travel is not known here.
+
+pub mod depot;
+pub mod driver;
+pub mod executor;
+pub mod fleet;
+pub mod frames;
+pub mod message;
+mod parts;
+mod prepare;
+pub mod station;
+pub mod storage;
+#[cfg(test)]
+mod tests;
+
+pub use depot::Depot;
+pub use fleet::Fleet;
+pub use message::{Answer, Beat, Failure, Poll, Report, Stage, Work, WorkerId};
+pub use station::{Link, LinkError, Station};
+pub use storage::{Endpoint, Storage};

@@ -1,0 +1,389 @@
+//! A worker: slots that ask for work, do it next to their own store, and report.
+
+use std::collections::BTreeMap;
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::path::PathBuf;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::{Duration, Instant};
+
+use rayherd_render::film::FilmPart;
+use rayherd_render::frame::Frame;
+use rayherd_scene::manifest::Manifest;
+use rayherd_scene::objects::{ObjectRef, ObjectStore};
+use tokio::runtime::Runtime;
+
+use super::Depot;
+use super::message::{Answer, Beat, Done, Failure, Poll, Report, Stage, Work, WorkerId};
+use super::prepare::prepare_scene;
+use crate::job::spec::definition;
+use crate::job::{Image, JobError, JobSettings, NodeSpec, PreparedScene};
+use crate::ledger::FilmRef;
+use crate::local::attempt::{self, Attempt, Shared};
+use crate::local::nodes::{Fetch, Nodes, placement};
+use crate::local::slots::StopFlag;
+use crate::local::usage::thread_cpu;
+use crate::picture;
+use crate::report::{Bytes, Kind, Place};
+use crate::store::{SceneObjects, StoreError, object_key};
+use crate::task::codec;
+
+/// Between two signs of life.
+const BEAT: Duration = Duration::from_secs(1);
+/// Before an operator that did not answer is asked again.
+const PAUSE: Duration = Duration::from_millis(500);
+/// How long a report is offered to an operator that does not answer.
+const PATIENCE: Duration = Duration::from_secs(120);
+
+/// The way to the operator.
+pub trait Link: Send + Sync {
+    /// Asks for work; may take its time.
+    fn poll(&self, poll: &Poll) -> Result<Answer, LinkError>;
+    /// Tells what was done.
+    fn report(&self, report: &Report) -> Result<(), LinkError>;
+    /// Gives a sign of life; what need not go on.
+    fn beat(&self, beat: &Beat) -> Result<Vec<String>, LinkError>;
+}
+
+/// The operator did not answer, or refused.
+#[derive(Debug, thiserror::Error)]
+#[error("operator: {0}")]
+pub struct LinkError(pub String);
+
+/// A worker.
+pub struct Station<'l> {
+    link: &'l dyn Link,
+    depot: Depot,
+    slots: u32,
+    worker: WorkerId,
+    scratch: PathBuf,
+    runtime: Runtime,
+    running: Mutex<BTreeMap<String, StopFlag>>,
+    leaving: AtomicBool,
+}
+
+/// What comes after a stage.
+enum Next {
+    Open(Option<Box<Stage>>),
+    Over,
+}
+
+impl<'l> Station<'l> {
+    /// A worker with so many slots. `scratch` is a folder of its own for what is on its way.
+    ///
+    /// # Errors
+    /// When there are no threads for input and output.
+    pub fn new(
+        link: &'l dyn Link,
+        depot: Depot,
+        slots: u32,
+        worker: WorkerId,
+        scratch: PathBuf,
+    ) -> Result<Self, JobError> {
+        let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(1).enable_all().build();
+        let runtime = runtime.map_err(|e| JobError::Internal(format!("no runtime for input and output: {e}")))?;
+        let (running, leaving) = (Mutex::default(), AtomicBool::new(false));
+        Ok(Station { link, depot, slots: slots.max(1), worker, scratch, runtime, running, leaving })
+    }
+
+    /// Works until the job is over, or [`Station::leave`] was called.
+    ///
+    /// # Errors
+    /// When a stage cannot be opened and never will be.
+    pub fn run(&self) -> Result<(), JobError> {
+        std::thread::scope(|scope| {
+            scope.spawn(|| self.beat());
+            let result = self.stages();
+            self.leaving.store(true, Ordering::Relaxed);
+            result
+        })
+    }
+
+    /// Stops what runs, which is given back, and ends.
+    pub fn leave(&self) {
+        self.leaving.store(true, Ordering::Relaxed);
+        self.lock().values().for_each(StopFlag::set);
+    }
+
+    /// Whether nothing runs, and nothing is about to.
+    pub fn is_idle(&self) -> bool {
+        self.is_leaving() && self.lock().is_empty()
+    }
+
+    fn lock(&self) -> MutexGuard<'_, BTreeMap<String, StopFlag>> {
+        self.running.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+    fn is_leaving(&self) -> bool {
+        self.leaving.load(Ordering::Relaxed)
+    }
+
+    fn beat(&self) {
+        while !self.is_leaving() {
+            let running: Vec<String> = self.lock().keys().cloned().collect();
+            match self.link.beat(&Beat { worker: self.worker.clone(), running }) {
+                Ok(superfluous) => {
+                    let running = self.lock();
+                    superfluous.iter().filter_map(|id| running.get(id)).for_each(StopFlag::set);
+                }
+                Err(e) => tracing::debug!("{e}"),
+            }
+            std::thread::sleep(BEAT);
+        }
+    }
+
+    fn stages(&self) -> Result<(), JobError> {
+        let mut stage: Option<Box<Stage>> = None;
+        while !self.is_leaving() {
+            let next = match &stage {
+                None => self.slots(None, None),
+                Some(stage) => self.in_stage(stage)?,
+            };
+            match next {
+                Next::Open(next) => stage = next,
+                Next::Over => return Ok(()),
+            }
+        }
+        Ok(())
+    }
+
+    fn in_stage(&self, stage: &Stage) -> Result<Next, JobError> {
+        let scene = loop {
+            match self.open(stage) {
+                Ok(scene) => break scene,
+                Err(e) if matches!(Failure::from(&e), Failure::ForNow { .. }) && !self.is_leaving() => {
+                    tracing::warn!("{e}; trying again");
+                    std::thread::sleep(PAUSE);
+                }
+                Err(e) => return Err(e),
+            }
+        };
+        let disks = self.depot.len();
+        // one more than there are disks: who has none at home stands on no disk's node
+        let settings = JobSettings {
+            strategy: stage.strategy,
+            nodes: vec![NodeSpec { slots: self.slots }; disks as usize + 1],
+            memory_per_node: stage.memory,
+            replicas: stage.replicas,
+            ..JobSettings::default()
+        };
+        let part = Arc::new(self.depot.part(&stage.prefix, stage.replicas)?);
+        let near = Near { station: self, placement: placement(&scene, disks, stage.replicas) };
+        let nodes = Nodes::real(&scene, &settings, part, disks, Some(Box::new(near)))?;
+        let shared = Shared {
+            scene: &scene,
+            frame: &stage.frame,
+            settings: &settings,
+            nodes,
+            store_film: true,
+            buckets: stage.buckets,
+        };
+        Ok(self.slots(Some(stage), Some(&shared)))
+    }
+
+    fn open(&self, stage: &Stage) -> Result<PreparedScene, JobError> {
+        let store = self.depot.replicated(stage.replicas)?;
+        let objects: Arc<dyn ObjectStore> =
+            Arc::new(SceneObjects::new(Arc::new(store), self.runtime.handle().clone())?);
+        PreparedScene::open(Manifest::load(objects.as_ref(), &stage.scene)?, objects)
+    }
+
+    /// Runs all slots, and a clerk, until one is told of another stage, as then all are.
+    fn slots(&self, stage: Option<&Stage>, shared: Option<&Shared>) -> Next {
+        std::thread::scope(|scope| {
+            let threads: Vec<_> =
+                (0..=self.slots).map(|n| scope.spawn(move || self.slot(stage, shared, n == self.slots))).collect();
+            let mut next = Next::Over;
+            for thread in threads {
+                match thread.join() {
+                    Ok(Next::Over) => {}
+                    Ok(open) => next = open,
+                    Err(_) => tracing::error!("a slot panicked"),
+                }
+            }
+            next
+        })
+    }
+
+    fn slot(&self, stage: Option<&Stage>, shared: Option<&Shared>, clerk: bool) -> Next {
+        let worker = self.worker.clone();
+        let poll = Poll { worker, home: self.depot.home(), stage: stage.map(|s| s.id.clone()), clerk };
+        while !self.is_leaving() {
+            match self.link.poll(&poll) {
+                Ok(Answer::Wait) => {}
+                Ok(Answer::Work { id, work }) => self.work(id, &work, stage, shared),
+                Ok(Answer::Open { stage }) => return Next::Open(stage),
+                Ok(Answer::Over) => return Next::Over,
+                Err(e) => {
+                    tracing::warn!("{e}");
+                    std::thread::sleep(PAUSE);
+                }
+            }
+        }
+        Next::Over
+    }
+
+    fn work(&self, id: String, work: &Work, stage: Option<&Stage>, shared: Option<&Shared>) {
+        let stop = StopFlag::new(None);
+        self.lock().insert(id.clone(), stop.clone());
+        if self.is_leaving() {
+            stop.set();
+        }
+        let before = thread_cpu();
+        let result = catch_unwind(AssertUnwindSafe(|| self.done(work, stage, shared, &stop)))
+            .unwrap_or_else(|_| Err(JobError::Internal("a task panicked".into())));
+        let cpu = thread_cpu() - before;
+        let result = result.map_err(|e| {
+            let failure = Failure::from(&e);
+            if failure != Failure::Stopped {
+                tracing::warn!("{e}");
+            }
+            failure
+        });
+        let bytes = shared.map_or_else(Bytes::default, |s| s.nodes.take_bytes()).rows();
+        let report = Report { worker: self.worker.clone(), id: id.clone(), result, cpu, bytes };
+        let since = Instant::now();
+        while let Err(e) = self.link.report(&report) {
+            tracing::warn!("{e}");
+            // nobody answers: what was made is done again by others
+            if since.elapsed() > PATIENCE || self.is_leaving() {
+                break;
+            }
+            std::thread::sleep(PAUSE);
+        }
+        self.lock().remove(&id);
+    }
+
+    fn done(
+        &self,
+        work: &Work,
+        stage: Option<&Stage>,
+        shared: Option<&Shared>,
+        stop: &StopFlag,
+    ) -> Result<Done, JobError> {
+        let open = || stage.zip(shared).ok_or_else(|| JobError::Internal("work of a stage that is not open".into()));
+        match work {
+            Work::Prepare { spec, replicas } => {
+                let (scene, reused) =
+                    prepare_scene(&self.depot, self.runtime.handle(), spec, *replicas, &self.scratch)?;
+                Ok(Done::Prepared { scene, reused })
+            }
+            Work::Attempt { attempt } => {
+                let (_, shared) = open()?;
+                let attempt = Attempt { node: self.node(), ..attempt.clone() };
+                let made = attempt::run(shared, &attempt, stop)?;
+                Ok(Done::Made { outputs: made.outputs, hops: made.hops })
+            }
+            Work::Merge { name, parts, spp, picture } => {
+                let (_, shared) = open()?;
+                self.merge(shared, name.as_deref(), parts, *spp, picture.as_deref())
+            }
+        }
+    }
+
+    /// Our place among the stores; one past them when none is here.
+    fn node(&self) -> u32 {
+        self.depot.home().unwrap_or(self.depot.len())
+    }
+
+    fn merge(
+        &self,
+        shared: &Shared,
+        name: Option<&str>,
+        parts: &[FilmRef],
+        spp: u32,
+        picture: Option<&str>,
+    ) -> Result<Done, JobError> {
+        let (nodes, size) = (&shared.nodes, shared.frame.size);
+        let mut sum = FilmPart::new(size);
+        for part in parts {
+            let open = |body: &bytes::Bytes| codec::decode_film(size, body);
+            sum.merge(&nodes.get(self.node(), Kind::Film, &part.key, &part.holders, open)?)?;
+        }
+        let film = match name {
+            Some(key) if sum.touched() > 0 || sum.rejected().count > 0 => {
+                let body = codec::encode_film(&sum);
+                let bytes = body.len() as u64;
+                let holders = nodes.put(self.node(), Kind::Film, key, body)?;
+                Some(FilmRef { key: key.to_owned(), bytes, holders })
+            }
+            _ => None,
+        };
+        let picture = picture.map(|key| self.write_picture(shared.scene, shared.frame, &sum, spp, key)).transpose()?;
+        Ok(Done::Merged { film, rel_mse: sum.rel_mse(spp), picture: picture.unwrap_or_default() })
+    }
+
+    /// Writes the picture on the first stores that take it; where it lies.
+    fn write_picture(
+        &self,
+        scene: &PreparedScene,
+        frame: &Frame,
+        sum: &FilmPart,
+        spp: u32,
+        key: &str,
+    ) -> Result<Vec<String>, JobError> {
+        let body = picture::encode(&image_of(sum, spp), &definition(&scene.manifest, frame, spp)?)?;
+        let body = bytes::Bytes::from(body);
+        let mut at = Vec::new();
+        let mut error = None;
+        // on every store, so that each of them shows it
+        for store in self.depot.stores() {
+            match self.runtime.block_on(store.put(key, body.clone())) {
+                Ok(()) => at.push(format!("{}/{key}", store.describe())),
+                Err(e) => {
+                    tracing::warn!("{e}");
+                    error = Some(e);
+                }
+            }
+        }
+        match error {
+            Some(e) if at.is_empty() => Err(e.into()),
+            _ => Ok(at),
+        }
+    }
+}
+
+/// Reads blocks from the store at home first, then from where they belong, then from anywhere.
+struct Near<'s, 'l> {
+    station: &'s Station<'l>,
+    placement: Vec<Vec<u32>>,
+}
+
+impl Fetch for Near<'_, '_> {
+    fn fetch(&self, split: u32, object: &ObjectRef) -> Result<(Vec<u8>, Place), JobError> {
+        let depot = &self.station.depot;
+        let home = depot.home();
+        let holders = self.placement[split as usize].iter().copied().filter(|&h| Some(h) != home);
+        let mut order: Vec<u32> = home.into_iter().chain(holders).collect();
+        order.extend((0..depot.len()).filter(|n| !order.contains(n)).collect::<Vec<u32>>());
+        let key = object_key(&object.hash);
+        let mut error = None;
+        for number in order {
+            let store = &depot.stores()[number as usize];
+            let why = match self.station.runtime.block_on(store.get(&key)) {
+                Ok(body) => match object.verify(&body) {
+                    Ok(()) => {
+                        let place = if Some(number) == home { Place::Local } else { Place::Remote };
+                        return Ok((body.into(), place));
+                    }
+                    Err(message) => StoreError::Corrupt { store: store.describe(), key: key.clone(), message },
+                },
+                Err(e) => e,
+            };
+            if !matches!(why, StoreError::NotFound { .. }) {
+                tracing::warn!("{why}");
+            }
+            // the one that may pass tells whether to try again
+            error = match error {
+                Some(e @ StoreError::Unavailable { .. }) => Some(e),
+                _ => Some(why),
+            };
+        }
+        Err(error.map_or_else(|| JobError::Internal("no store was asked".into()), JobError::from))
+    }
+}
+
+/// The picture of a film.
+fn image_of(film: &FilmPart, spp: u32) -> Image {
+    let [width, height] = film.size();
+    Image { width, height, pixels: film.resolve(spp) }
+}

@@ -1,0 +1,336 @@
+//! Whole jobs over stores in memory: operator and workers in this process, the messages as they would go over the wire.
+
+use std::collections::BTreeMap;
+use std::sync::atomic::{AtomicU32, Ordering};
+use std::sync::{Arc, Mutex};
+use std::time::{Duration, Instant};
+
+use rayherd_api::{RenderJobSpec, Strategy};
+use rayherd_scene::import::{DescriptionSource, StreamOptions, import};
+use rayherd_scene::objects::{MemoryObjects, ObjectRef};
+use rayherd_scene::prepare::{NoProgress, SpoolSettings, prepare};
+use tokio::runtime::{Handle, Runtime};
+
+use super::frames::{Job, Keeper, run};
+use super::message::{Answer, Beat, Poll, Report, WorkerId};
+use super::{Depot, Fleet, Link, LinkError, Station};
+use crate::job::{JobError, JobSettings, PreparedScene, Sampling, Silent, spec as from_spec};
+use crate::local::render_local;
+use crate::picture;
+use crate::report;
+use crate::store::{BlockStore, FaultPlan, Faulty, MemoryStore};
+
+const CORNELL: &str = include_str!("../../../examples/cornell-box.xml");
+const SOURCE: &str = "scenes/cornell/box.xml";
+
+/// Messages as text, as over the wire.
+struct Wire<'a> {
+    fleet: &'a Fleet,
+    runtime: Handle,
+    polls: AtomicU32,
+    /// Attempts that were handed out before this stops being an operator.
+    attempts: AtomicU32,
+}
+
+fn over<T: serde::Serialize + serde::de::DeserializeOwned>(message: &T) -> T {
+    serde_json::from_str(&serde_json::to_string(message).unwrap()).unwrap()
+}
+
+impl Link for Wire<'_> {
+    fn poll(&self, poll: &Poll) -> Result<Answer, LinkError> {
+        self.polls.fetch_add(1, Ordering::Relaxed);
+        let answer = self.runtime.block_on(self.fleet.poll(&over(poll), Duration::from_millis(200)));
+        let answer = answer.map_err(|e| LinkError(e.to_string()))?;
+        if matches!(&answer, Answer::Work { work, .. } if matches!(**work, super::Work::Attempt { .. })) {
+            self.attempts.fetch_add(1, Ordering::Relaxed);
+        }
+        Ok(over(&answer))
+    }
+    fn report(&self, report: &Report) -> Result<(), LinkError> {
+        self.fleet.report(over(report)).map(drop).map_err(|e| LinkError(e.to_string()))
+    }
+    fn beat(&self, beat: &Beat) -> Result<Vec<String>, LinkError> {
+        self.fleet.beat(&over(beat)).map_err(|e| LinkError(e.to_string()))
+    }
+}
+
+/// What etcd would keep.
+#[derive(Default)]
+struct Kept {
+    pointers: Mutex<BTreeMap<u32, (u64, String)>>,
+    prepared: Mutex<Vec<(ObjectRef, bool)>>,
+    reports: Mutex<Vec<report::Report>>,
+    pictures: Mutex<Vec<Vec<String>>>,
+}
+
+impl Keeper for Kept {
+    fn newest(&self, frame: u32) -> Option<(u64, String)> {
+        self.pointers.lock().unwrap().get(&frame).cloned()
+    }
+    fn move_to(&self, frame: u32, sequence: u64, name: &str) -> Result<(), JobError> {
+        let old = self.pointers.lock().unwrap().insert(frame, (sequence, name.to_owned()));
+        assert!(old.is_none_or(|o| o.0 + 1 == sequence), "the pointer moves by one record");
+        Ok(())
+    }
+    fn prepared(&self, scene: &ObjectRef, reused: bool) {
+        self.prepared.lock().unwrap().push((*scene, reused));
+    }
+    fn placed(&self, bytes: &[u64]) {
+        assert!(bytes.iter().sum::<u64>() > 0);
+    }
+    fn done(&self, _: u32, picture: &[String], report: &report::Report) {
+        self.pictures.lock().unwrap().push(picture.to_vec());
+        self.reports.lock().unwrap().push(report.clone());
+    }
+}
+
+fn spec(strategy: Strategy, splits: i64, replicas: i32) -> RenderJobSpec {
+    let mut spec =
+        RenderJobSpec { strategy, splits: Some(splits), replicas: Some(replicas), ..RenderJobSpec::default() };
+    spec.scene.source = SOURCE.into();
+    spec.image.size = Some("48x40".parse().unwrap());
+    spec.sampling.spp = Some(6);
+    spec.sampling.max_depth = Some(5);
+    spec.task_seconds = Some(0.01);
+    spec
+}
+
+/// The file that a local run would write.
+fn expected(spec: &RenderJobSpec) -> Vec<u8> {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("box.xml");
+    std::fs::write(&path, CORNELL).unwrap();
+    let description = import(&path, &from_spec::import_options(spec)).unwrap();
+    let source = DescriptionSource::new(&description, StreamOptions::default());
+    let objects = Arc::new(MemoryObjects::default());
+    let settings = from_spec::prepare_settings(spec);
+    let made = prepare(&description, &source, &settings, &SpoolSettings::default(), objects.as_ref(), &NoProgress);
+    let scene = PreparedScene::open(made.unwrap().manifest, objects).unwrap();
+    let frame = from_spec::frame(spec, &scene.manifest, None).unwrap();
+    let sampling = Sampling { spp: 6, target_error: None, time_limit: None };
+    let out = render_local(&scene, &frame, &sampling, &JobSettings::default(), &Silent).unwrap();
+    picture::encode(&out.image, &from_spec::definition(&scene.manifest, &frame, out.spp).unwrap()).unwrap()
+}
+
+struct Cluster {
+    stores: Vec<Arc<Faulty>>,
+    runtime: Runtime,
+    scratch: tempfile::TempDir,
+}
+
+impl Cluster {
+    fn new(nodes: usize) -> Self {
+        let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build().unwrap();
+        let memory = || Arc::new(Faulty::new(Arc::new(MemoryStore::default()), FaultPlan::default()));
+        let cluster =
+            Cluster { stores: (0..nodes).map(|_| memory()).collect(), runtime, scratch: tempfile::tempdir().unwrap() };
+        cluster.runtime.block_on(cluster.stores[0].put(SOURCE, CORNELL.into())).unwrap();
+        cluster
+    }
+    fn depot(&self, home: Option<u32>) -> Depot {
+        Depot::new(self.stores.iter().map(|s| s.clone() as Arc<dyn BlockStore>).collect(), home).unwrap()
+    }
+    fn job<'a>(&self, spec: &'a RenderJobSpec, depot: &'a Depot, fleet: &'a Fleet, session: &str) -> Job<'a> {
+        Job {
+            spec,
+            pictures: vec!["out/a.exr".into()],
+            prefix: "jobs/1".into(),
+            session: session.into(),
+            depot,
+            fleet,
+            slots: vec![1; 3],
+            runtime: self.runtime.handle().clone(),
+        }
+    }
+    fn station<'l>(&self, link: &'l Wire<'l>, number: u32, session: &str, home: Option<u32>) -> Station<'l> {
+        // the same path for all workers, as in their pods: it is part of a source's fingerprint
+        let scratch = self.scratch.path().to_owned();
+        let worker = WorkerId { number, session: session.into() };
+        Station::new(link, self.depot(home), 1, worker, scratch).unwrap()
+    }
+    fn wire<'a>(&self, fleet: &'a Fleet) -> Wire<'a> {
+        Wire { fleet, runtime: self.runtime.handle().clone(), polls: AtomicU32::new(0), attempts: AtomicU32::new(0) }
+    }
+    fn picture(&self, store: usize) -> Vec<u8> {
+        self.runtime.block_on(self.stores[store].get("out/a.exr")).unwrap().to_vec()
+    }
+    /// A whole job with three workers, one of them on a node without a store.
+    fn render(&self, spec: &RenderJobSpec, kept: &Arc<Kept>) -> Result<(), JobError> {
+        let (fleet, depot) = (Fleet::new(3, "e"), self.depot(None));
+        let wire = self.wire(&fleet);
+        std::thread::scope(|scope| {
+            for number in 0..3 {
+                let home = (number < 2).then_some(number);
+                let station = self.station(&wire, number, "s", home);
+                scope.spawn(move || station.run().unwrap());
+            }
+            let keeper: Arc<dyn Keeper> = kept.clone();
+            let result = run(&self.job(spec, &depot, &fleet, "e"), &keeper, &Silent);
+            fleet.end();
+            result
+        })
+    }
+}
+
+fn wait_for(what: impl Fn() -> bool) {
+    let since = Instant::now();
+    while !what() {
+        assert!(since.elapsed() < Duration::from_secs(120), "waited in vain");
+        std::thread::sleep(Duration::from_millis(2));
+    }
+}
+
+#[test]
+fn every_strategy_makes_the_bytes_of_a_local_run() {
+    for (strategy, splits, memory) in [
+        (Strategy::Auto, 1, None),
+        (Strategy::Auto, 6, Some("64Ki")),
+        (Strategy::DemandDriven, 4, None),
+        (Strategy::SchedulingGrid, 4, None),
+        (Strategy::SchedulingGridOverlapReduced, 4, None),
+    ] {
+        let mut spec = spec(strategy, splits, 2);
+        spec.workers.memory = memory.map(|m: &str| m.parse().unwrap());
+        let (cluster, kept) = (Cluster::new(2), Arc::new(Kept::default()));
+        if let Err(e) = cluster.render(&spec, &kept) {
+            panic!("{strategy}: {e}");
+        }
+        assert!(cluster.picture(0) == expected(&spec), "{strategy}");
+        assert!(cluster.picture(1) == cluster.picture(0));
+        let reports = kept.reports.lock().unwrap();
+        assert!(reports[0].tasks > 1 && reports[0].scene_passes > 0.0, "{:?}", reports[0]);
+        assert_eq!(kept.pictures.lock().unwrap()[0].len(), 2);
+    }
+}
+
+#[test]
+fn a_scene_is_prepared_once_and_a_finished_job_is_not_done_again() {
+    let spec = spec(Strategy::Auto, 4, 1);
+    let (cluster, kept) = (Cluster::new(3), Arc::new(Kept::default()));
+    cluster.render(&spec, &kept).unwrap();
+    let first = cluster.picture(0);
+    cluster.render(&spec, &kept).unwrap();
+    assert!(cluster.picture(0) == first);
+    let reports = kept.reports.lock().unwrap();
+    assert_eq!((reports[1].tasks, reports[1].tasks_reused), (0, reports[0].tasks), "all of it was in the ledger");
+    let prepared = kept.prepared.lock().unwrap();
+    assert!(!prepared[0].1 && prepared[1].1, "{prepared:?}");
+}
+
+#[test]
+fn workers_and_operators_that_go_change_no_byte() {
+    let spec = spec(Strategy::SchedulingGridOverlapReduced, 4, 2);
+    let want = expected(&spec);
+    let (cluster, kept) = (Cluster::new(3), Arc::new(Kept::default()));
+    let depot = cluster.depot(None);
+    // the operator is stopped after some commits, and a worker with a task in hand leaves before
+    let first = Fleet::new(3, "e1");
+    let wire = cluster.wire(&first);
+    std::thread::scope(|scope| {
+        let stations: Vec<Arc<Station>> = (0..3).map(|n| Arc::new(cluster.station(&wire, n, "s1", Some(n)))).collect();
+        for station in &stations {
+            let station = station.clone();
+            scope.spawn(move || station.run().unwrap());
+        }
+        let keeper: Arc<dyn Keeper> = kept.clone();
+        let (spec, depot, first, cluster, kept) = (&spec, &depot, &first, &cluster, &kept);
+        let job = scope.spawn(move || run(&cluster.job(spec, depot, first, "e1"), &keeper, &Silent));
+        wait_for(|| wire.attempts.load(Ordering::Relaxed) >= 4);
+        stations[1].leave();
+        wait_for(|| kept.newest(0).is_some_and(|p| p.0 >= 6));
+        first.cancel("stopped by the test");
+        let stopped = job.join().unwrap();
+        assert!(matches!(stopped, Err(JobError::Owned(_))), "{:?}", stopped.err());
+        first.end();
+    });
+    let committed = kept.newest(0).unwrap().0;
+    assert!(committed >= 6);
+    // a record that was written beyond the pointer does not count
+    let second = Fleet::new(3, "e2");
+    let wire = cluster.wire(&second);
+    std::thread::scope(|scope| {
+        for number in 0..3 {
+            let station = cluster.station(&wire, number, "s2", Some(number));
+            scope.spawn(move || station.run().unwrap());
+        }
+        let keeper: Arc<dyn Keeper> = kept.clone();
+        run(&cluster.job(&spec, &depot, &second, "e2"), &keeper, &Silent).unwrap();
+        second.end();
+    });
+    assert!(cluster.picture(2) == want);
+    assert!(kept.reports.lock().unwrap()[0].tasks_reused > 0);
+}
+
+#[test]
+fn a_worker_that_comes_back_under_another_session_loses_only_its_tasks() {
+    let fleet = Fleet::new(1, "e");
+    let poll = |session: &str| Poll {
+        worker: WorkerId { number: 0, session: session.into() },
+        home: None,
+        stage: None,
+        clerk: false,
+    };
+    assert_eq!(fleet.answer(&poll("a")), Ok(Answer::Wait));
+    let stranger = Poll { worker: WorkerId { number: 1, session: "a".into() }, ..poll("a") };
+    assert!(fleet.answer(&stranger).is_err());
+    std::thread::scope(|scope| {
+        let work = super::Work::Merge { name: None, parts: vec![], spp: 1, picture: None };
+        let call = scope.spawn(|| fleet.call(work));
+        let handed = |session: &str| {
+            let since = Instant::now();
+            loop {
+                match fleet.answer(&poll(session)).unwrap() {
+                    Answer::Work { id, .. } => return id,
+                    _ => assert!(since.elapsed() < Duration::from_secs(60)),
+                }
+                std::thread::sleep(Duration::from_millis(1));
+            }
+        };
+        let first = handed("a");
+        let second = handed("b");
+        assert_ne!(first, second);
+        let report = |session: &str, id: &str, rel_mse| Report {
+            worker: WorkerId { number: 0, session: session.into() },
+            id: id.into(),
+            result: Ok(super::message::Done::Merged { film: None, rel_mse, picture: vec![] }),
+            cpu: 0.0,
+            bytes: vec![],
+        };
+        assert_eq!(fleet.report(report("b", &first, Some(1.0))), Ok(false), "its id is known no more");
+        assert_eq!(fleet.report(report("b", "other-0", Some(2.0))), Ok(false));
+        let beat = Beat { worker: poll("b").worker, running: vec![first.clone(), second.clone()] };
+        assert_eq!(fleet.beat(&beat), Ok(vec![first]));
+        assert_eq!(fleet.report(report("b", &second, Some(3.0))), Ok(true));
+        assert_eq!(fleet.report(report("b", &second, Some(4.0))), Ok(false), "a replay");
+        let done = call.join().unwrap().unwrap();
+        assert!(matches!(done, super::message::Done::Merged { rel_mse: Some(x), .. } if x == 3.0));
+    });
+}
+
+#[test]
+fn a_store_that_goes_while_rays_wait_costs_copies_and_no_byte() {
+    let spec = spec(Strategy::SchedulingGridOverlapReduced, 4, 2);
+    let (cluster, kept) = (Cluster::new(3), Arc::new(Kept::default()));
+    let (fleet, depot) = (Fleet::new(3, "e"), cluster.depot(None));
+    let wire = cluster.wire(&fleet);
+    std::thread::scope(|scope| {
+        for number in 0..3 {
+            let station = cluster.station(&wire, number, "s", Some(number));
+            scope.spawn(move || station.run().unwrap());
+        }
+        let keeper: Arc<dyn Keeper> = kept.clone();
+        let (spec, depot, fleet, cluster) = (&spec, &depot, &fleet, &cluster);
+        let job = scope.spawn(move || {
+            let result = run(&cluster.job(spec, depot, fleet, "e"), &keeper, &Silent);
+            fleet.end();
+            result
+        });
+        wait_for(|| kept.newest(0).is_some_and(|p| p.0 >= 3));
+        cluster.stores[1].lose();
+        if let Err(e) = job.join().unwrap() {
+            panic!("{e}");
+        }
+    });
+    assert!(cluster.picture(2) == expected(&spec));
+    assert_eq!(kept.reports.lock().unwrap()[0].tasks_redone, 0);
+}

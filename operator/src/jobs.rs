@@ -1,0 +1,98 @@
+//! The jobs that this operator runs, each on a thread of its own.
+
+use std::collections::BTreeMap;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+
+use k8s_openapi::jiff::Timestamp;
+use rayherd_herd::job::Status;
+use rayherd_herd::remote::{Fleet, Storage};
+use rayherd_herd::report::Report;
+
+/// A job that runs, or has run.
+pub struct Running {
+    /// The generation of the spec that it runs.
+    pub generation: i64,
+    /// Its workers.
+    pub fleet: Fleet,
+    /// Its storage, as it was when the job began.
+    pub storage: Storage,
+    /// How far it is.
+    pub state: Mutex<State>,
+}
+
+/// How far a job is.
+#[derive(Clone, Debug, Default)]
+pub struct State {
+    /// When its thread began.
+    pub started: Option<Timestamp>,
+    /// When the first trace task was handed out.
+    pub first_task: Option<Timestamp>,
+    /// The scene's manifest, when it is prepared.
+    pub scene: Option<String>,
+    /// It was prepared before.
+    pub reused: bool,
+    /// The scene's bytes by node.
+    pub held: BTreeMap<String, u64>,
+    /// Of the current frame.
+    pub status: Status,
+    /// Of the frames that are done.
+    pub reports: Vec<Report>,
+    /// The finished pictures.
+    pub pictures: Vec<String>,
+    /// How it ended, and when.
+    pub end: Option<(Timestamp, Result<(), Problem>)>,
+    /// Pods whose tokens count, by uid, with the worker that each is.
+    pub pods: BTreeMap<String, u32>,
+}
+
+/// Why a job did not come to its end.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Problem {
+    /// What, and what to do.
+    pub message: String,
+    /// This operator was told to stop running it: nothing is wrong with the job.
+    pub stopped: bool,
+}
+
+impl Running {
+    /// How far it is.
+    pub fn lock(&self) -> MutexGuard<'_, State> {
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+    /// Whether its thread has ended.
+    pub fn is_over(&self) -> bool {
+        self.lock().end.is_some()
+    }
+}
+
+/// All of them, by uid.
+#[derive(Default)]
+pub struct Jobs(Mutex<BTreeMap<String, Arc<Running>>>);
+
+impl Jobs {
+    fn lock(&self) -> MutexGuard<'_, BTreeMap<String, Arc<Running>>> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+    /// A job, if it runs or has run here.
+    pub fn get(&self, uid: &str) -> Option<Arc<Running>> {
+        self.lock().get(uid).cloned()
+    }
+    /// Adds a job.
+    pub fn insert(&self, uid: &str, running: Arc<Running>) {
+        self.lock().insert(uid.to_owned(), running);
+    }
+    /// Forgets a job, whose workers are told that it is over.
+    pub fn remove(&self, uid: &str) {
+        if let Some(running) = self.lock().remove(uid) {
+            running.fleet.end();
+        }
+    }
+    /// All of them.
+    pub fn all(&self) -> Vec<Arc<Running>> {
+        self.lock().values().cloned().collect()
+    }
+    /// Stops all; what was committed stays, and workers wait for the next operator.
+    pub fn stop_all(&self, why: &str) {
+        self.all().iter().for_each(|r| r.fleet.cancel(why));
+    }
+}

@@ -1,0 +1,168 @@
+//! What the operator tells Prometheus.
+
+use std::sync::Arc;
+
+use axum::Router;
+use axum::extract::State;
+use axum::routing::get;
+use prometheus::{Encoder, GaugeVec, Histogram, HistogramOpts, IntCounter, Opts, Registry, TextEncoder};
+use rayherd_herd::report::{Kind, Op, Place};
+
+use crate::jobs::Running;
+use crate::reconcile::Context;
+
+/// All metrics.
+pub struct Metrics {
+    registry: Registry,
+    /// Steps that failed.
+    pub errors: IntCounter,
+    /// Jobs that were begun, or gone on with.
+    pub started: IntCounter,
+    /// Requests of workers that were refused.
+    pub refused: IntCounter,
+    /// How long steps take.
+    pub reconcile_seconds: Histogram,
+    cpu: GaugeVec,
+    remote: GaugeVec,
+    bytes: GaugeVec,
+    rounds: GaugeVec,
+    tasks: GaugeVec,
+    waiting: GaugeVec,
+    workers: GaugeVec,
+    error: GaugeVec,
+}
+
+const JOB: [&str; 2] = ["namespace", "job"];
+
+impl Metrics {
+    /// All at 0.
+    ///
+    /// # Errors
+    /// When two have one name.
+    pub fn new() -> prometheus::Result<Self> {
+        let registry = Registry::new();
+        let counter = |name: &str, help: &str| -> prometheus::Result<IntCounter> {
+            let counter = IntCounter::new(name, help)?;
+            registry.register(Box::new(counter.clone()))?;
+            Ok(counter)
+        };
+        let gauge = |name: &str, help: &str, labels: &[&str]| -> prometheus::Result<GaugeVec> {
+            let gauge = GaugeVec::new(Opts::new(name, help), labels)?;
+            registry.register(Box::new(gauge.clone()))?;
+            Ok(gauge)
+        };
+        let buckets = vec![0.001, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0, 3.0];
+        let options = HistogramOpts::new("rayherd_reconcile_duration_seconds", "duration of a reconcile step");
+        let reconcile_seconds = Histogram::with_opts(options.buckets(buckets))?;
+        registry.register(Box::new(reconcile_seconds.clone()))?;
+        Ok(Metrics {
+            errors: counter("rayherd_reconcile_errors_total", "reconcile steps that failed")?,
+            started: counter("rayherd_jobs_started_total", "jobs that were begun or gone on with")?,
+            refused: counter("rayherd_worker_requests_refused_total", "requests of workers that were refused")?,
+            cpu: gauge("rayherd_job_cpu_seconds", "CPU-seconds of the workers' tasks", &JOB)?,
+            remote: gauge("rayherd_job_remote_read_ratio", "scene bytes read from other nodes, of all read", &JOB)?,
+            bytes: gauge("rayherd_job_bytes", "bytes moved", &["namespace", "job", "stage", "op", "kind", "place"])?,
+            rounds: gauge("rayherd_job_rounds", "rounds of the current frame", &JOB)?,
+            tasks: gauge("rayherd_job_tasks", "tasks committed for the frames that are done", &JOB)?,
+            waiting: gauge("rayherd_job_rays_waiting", "rays that wait in groups", &JOB)?,
+            workers: gauge("rayherd_job_workers_ready", "workers that ask for work", &JOB)?,
+            error: gauge("rayherd_job_relmse", "estimated relMSE of the last frame that is done", &JOB)?,
+            reconcile_seconds,
+            registry,
+        })
+    }
+
+    /// Sets a job's metrics.
+    pub fn observe(&self, namespace: &str, job: &str, running: &Running) {
+        let (state, tally) = (running.lock().clone(), running.fleet.tally());
+        let labels = [namespace, job];
+        let scene = |k: Kind| matches!(k, Kind::Geometry | Kind::Attributes | Kind::Texture);
+        let read = |place: Place| tally.bytes.sum(|_, o, k, p| o == Op::Read && p == place && scene(k));
+        let (near, far) = (read(Place::Local), read(Place::Remote));
+        if near + far > 0 {
+            self.remote.with_label_values(&labels).set(far as f64 / (near + far) as f64);
+        }
+        for row in tally.bytes.rows() {
+            // the names that reports use
+            let name = |v: serde_json::Result<serde_json::Value>| match v {
+                Ok(serde_json::Value::String(s)) => s,
+                _ => String::new(),
+            };
+            let (stage, op) = (name(serde_json::to_value(row.stage)), name(serde_json::to_value(row.op)));
+            let (kind, place) = (name(serde_json::to_value(row.kind)), name(serde_json::to_value(row.place)));
+            let labels = [namespace, job, &stage, &op, &kind, &place];
+            self.bytes.with_label_values(&labels).set(row.bytes as f64);
+        }
+        self.cpu.with_label_values(&labels).set(tally.cpu);
+        self.rounds.with_label_values(&labels).set(state.status.rounds as f64);
+        self.tasks.with_label_values(&labels).set(state.reports.iter().map(|r| r.tasks).sum::<u64>() as f64);
+        self.waiting.with_label_values(&labels).set(state.status.waiting as f64);
+        self.workers.with_label_values(&labels).set(f64::from(tally.ready));
+        if let Some(error) = state.reports.last().and_then(|r| r.rel_mse) {
+            self.error.with_label_values(&labels).set(error);
+        }
+    }
+
+    /// A job has ended: its labels go.
+    pub fn forget(&self, namespace: &str, job: &str) {
+        let gauges = [&self.cpu, &self.remote, &self.rounds, &self.tasks, &self.waiting, &self.workers, &self.error];
+        for gauge in gauges {
+            // one that was never set has nothing to remove
+            let _ = gauge.remove_label_values(&[namespace, job]);
+        }
+        self.forget_bytes(namespace, job);
+    }
+
+    fn forget_bytes(&self, namespace: &str, job: &str) {
+        use prometheus::core::Collector;
+        for family in self.bytes.collect() {
+            for metric in family.get_metric() {
+                let value = |n: &str| metric.get_label().iter().find(|l| l.name() == n).map(|l| l.value().to_owned());
+                if value("namespace").as_deref() != Some(namespace) || value("job").as_deref() != Some(job) {
+                    continue;
+                }
+                let all: Vec<String> =
+                    ["namespace", "job", "stage", "op", "kind", "place"].iter().filter_map(|n| value(n)).collect();
+                let all: Vec<&str> = all.iter().map(String::as_str).collect();
+                let _ = self.bytes.remove_label_values(&all);
+            }
+        }
+    }
+
+    /// As text.
+    ///
+    /// # Errors
+    /// When a metric cannot be written.
+    pub fn text(&self) -> prometheus::Result<String> {
+        let mut out = Vec::new();
+        TextEncoder::new().encode(&self.registry.gather(), &mut out)?;
+        Ok(String::from_utf8_lossy(&out).into_owned())
+    }
+}
+
+/// Serves `/metrics`, and `/healthz` for the kubelet.
+pub async fn serve(context: Arc<Context>) -> anyhow::Result<()> {
+    let listener = tokio::net::TcpListener::bind(context.config.metrics).await?;
+    let metrics = |State(context): State<Arc<Context>>| async move { context.metrics.text().unwrap_or_default() };
+    let router = Router::new().route("/metrics", get(metrics)).route("/healthz", get(|| async { "ok" }));
+    Ok(axum::serve(listener, router.with_state(context)).await?)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn names_are_unique_and_ended_jobs_leave_no_labels() {
+        let metrics = Metrics::new().unwrap();
+        for job in ["a", "b"] {
+            metrics.cpu.with_label_values(&["n", job]).set(1.5);
+            metrics.bytes.with_label_values(&["n", job, "trace", "read", "geometry", "local"]).set(7.0);
+        }
+        assert_eq!(metrics.text().unwrap().matches("job=\"a\"").count(), 2);
+        metrics.forget("n", "a");
+        let text = metrics.text().unwrap();
+        assert_eq!((text.matches("job=\"a\"").count(), text.matches("job=\"b\"").count()), (0, 2), "{text}");
+        assert!(text.contains("rayherd_reconcile_errors_total 0"));
+    }
+}

@@ -1,0 +1,329 @@
+//! One step towards what a RenderJob asks for: look, decide, apply, tell.
+
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use k8s_openapi::NamespaceResourceScope;
+use k8s_openapi::api::core::v1::Pod;
+use k8s_openapi::jiff::Timestamp;
+use kube::api::{DeleteParams, ListParams, Patch, PatchParams};
+use kube::runtime::controller::Action;
+use kube::{Api, Client, Resource, ResourceExt};
+use rayherd_api::resource::{RenderJobObject, RenderJobStatus};
+use rayherd_api::validate;
+use rayherd_herd::remote::Storage;
+use serde_json::json;
+
+use crate::build;
+use crate::config::Config;
+use crate::finish;
+use crate::jobs::{Jobs, Running};
+use crate::metrics::Metrics;
+use crate::run;
+use crate::status;
+use crate::storage::{self, StorageError};
+
+/// Field manager of everything but the ledger's pointers.
+const MANAGER: &str = "rayherd-operator";
+/// Objects of a job that Kubernetes does not know of: those in the storage.
+pub const FINALIZER: &str = "rayherd.io/storage";
+/// Between two looks at a job that runs.
+const LOOK: Duration = Duration::from_secs(1);
+/// Before a job whose surroundings are not there (yet) is looked at again.
+const AGAIN: Duration = Duration::from_secs(10);
+
+/// What reconciling works with.
+pub struct Context {
+    /// The API server.
+    pub client: Client,
+    /// Settings.
+    pub config: Config,
+    /// Jobs that run here.
+    pub jobs: Jobs,
+    /// Counts.
+    pub metrics: Metrics,
+}
+
+impl Context {
+    /// Nothing runs yet.
+    ///
+    /// # Errors
+    /// When a metric cannot be registered, which a test excludes.
+    pub fn new(client: Client, config: Config) -> anyhow::Result<Self> {
+        Ok(Context { client, config, jobs: Jobs::default(), metrics: Metrics::new()? })
+    }
+    /// Objects of every namespace that is watched.
+    pub fn everywhere<K>(&self) -> Api<K>
+    where
+        K: Resource<Scope = NamespaceResourceScope>,
+        K::DynamicType: Default,
+    {
+        match &self.config.watch {
+            Some(namespace) => Api::namespaced(self.client.clone(), namespace),
+            None => Api::all(self.client.clone()),
+        }
+    }
+}
+
+/// Why a step failed; it is tried again.
+#[derive(Debug, thiserror::Error)]
+pub enum Error {
+    /// The API server did not do it.
+    #[error("cannot {action}: {source}")]
+    Api {
+        /// What.
+        action: &'static str,
+        /// Why not.
+        source: kube::Error,
+    },
+    /// The storage cannot be found out.
+    #[error(transparent)]
+    Storage(#[from] StorageError),
+    /// The storage does not do it.
+    #[error("cannot clean the storage: {0}")]
+    Clean(String),
+    /// A mistake of Rayherd.
+    #[error("internal error: {0}; please report it")]
+    Internal(String),
+}
+
+fn api(action: &'static str) -> impl Fn(kube::Error) -> Error {
+    move |source| Error::Api { action, source }
+}
+
+/// Tries again, later for each failure in a row; jobs that fail together do not come back together.
+pub fn failed(job: Arc<RenderJobObject>, error: &Error, context: Arc<Context>) -> Action {
+    context.metrics.errors.inc();
+    tracing::warn!(job = %job.name_any(), "{error}");
+    let spread = u64::from(job.metadata.uid.as_deref().unwrap_or_default().bytes().fold(0u8, u8::wrapping_add));
+    Action::requeue(Duration::from_millis(3000 + 10 * spread))
+}
+
+/// One step.
+///
+/// # Errors
+/// When the API server or the storage does not do what is asked; the step is tried again.
+pub async fn reconcile(job: Arc<RenderJobObject>, context: Arc<Context>) -> Result<Action, Error> {
+    let since = Instant::now();
+    let result = step(&job, &context).await;
+    context.metrics.reconcile_seconds.observe(since.elapsed().as_secs_f64());
+    result
+}
+
+async fn step(job: &Arc<RenderJobObject>, context: &Arc<Context>) -> Result<Action, Error> {
+    let namespace = job.namespace().unwrap_or_default();
+    let uid = job.metadata.uid.clone().unwrap_or_default();
+    let jobs: Api<RenderJobObject> = Api::namespaced(context.client.clone(), &namespace);
+    if job.metadata.deletion_timestamp.is_some() {
+        return delete(job, context, &jobs, &uid).await;
+    }
+    if status::is_finished(job) {
+        context.jobs.remove(&uid);
+        remove_pods(job, context, &namespace, &uid).await?;
+        return Ok(Action::await_change());
+    }
+    let problems = validate(&job.job());
+    if !problems.is_empty() {
+        let told: Vec<String> = problems.iter().map(ToString::to_string).collect();
+        let refused = status::refused(job, "Invalid", &told.join("; "), true, Timestamp::now());
+        tell(job, &jobs, refused).await?;
+        return Ok(Action::await_change());
+    }
+    let running = match context.jobs.get(&uid) {
+        Some(running) if running.generation == job.metadata.generation.unwrap_or(0) => running,
+        Some(old) => {
+            // the spec was changed: what was committed stays, and the new one goes on from there
+            old.fleet.cancel("the job was changed");
+            if !old.is_over() {
+                return Ok(Action::requeue(Duration::from_millis(200)));
+            }
+            old.fleet.end();
+            start(job, context, &jobs, &namespace, &uid).await?
+        }
+        None => match start(job, context, &jobs, &namespace, &uid).await {
+            Err(Error::Storage(e @ StorageError::Missing(_))) => {
+                let refused = status::refused(job, "StorageMissing", &e.to_string(), false, Timestamp::now());
+                tell(job, &jobs, refused).await?;
+                return Ok(Action::requeue(AGAIN));
+            }
+            other => other?,
+        },
+    };
+    let stopped = matches!(&running.lock().end, Some((_, Err(p))) if p.stopped);
+    if stopped {
+        // somebody else moved the ledger, or the API server was away too long: begin anew from what it says
+        context.jobs.remove(&uid);
+        return Ok(Action::requeue(AGAIN));
+    }
+    // asked before its end is told: one that comes in between is told next time
+    let over = running.is_over();
+    if !over {
+        keep_pods(job, context, &namespace, &uid, &running).await?;
+    }
+    tell(job, &jobs, status::running(job, &running, Timestamp::now())).await?;
+    context.metrics.observe(&namespace, &job.name_any(), &running);
+    if over {
+        context.jobs.remove(&uid);
+        remove_pods(job, context, &namespace, &uid).await?;
+        return Ok(Action::await_change());
+    }
+    Ok(Action::requeue(LOOK))
+}
+
+/// Begins to run a job.
+async fn start(
+    job: &Arc<RenderJobObject>,
+    context: &Arc<Context>,
+    jobs: &Api<RenderJobObject>,
+    namespace: &str,
+    uid: &str,
+) -> Result<Arc<Running>, Error> {
+    let (storage, depot) = depot(context, job, namespace).await?;
+    let finalizers = job.metadata.finalizers.clone().unwrap_or_default();
+    let job = if !finalizers.iter().any(|f| f == FINALIZER) {
+        let all: Vec<String> = finalizers.into_iter().chain([FINALIZER.to_owned()]).collect();
+        // the version keeps two writers of the list from losing each other's entries
+        let patch = json!({"metadata": {"resourceVersion": job.metadata.resource_version, "finalizers": all}});
+        let patched = jobs.patch(&job.name_any(), &PatchParams::default(), &Patch::Merge(&patch)).await;
+        patched.map_err(api("note that the job has objects in the storage"))?
+    } else {
+        // as it is, not as a watch has it: the ledger's pointers may have moved since
+        jobs.get(&job.name_any()).await.map_err(api("read the job"))?
+    };
+    let job = Arc::new(job);
+    let running = run::start(context.client.clone(), job, storage, depot);
+    context.jobs.insert(uid, running.clone());
+    context.metrics.started.inc();
+    Ok(running)
+}
+
+async fn depot(
+    context: &Context,
+    job: &RenderJobObject,
+    namespace: &str,
+) -> Result<(Storage, rayherd_herd::remote::Depot), Error> {
+    let spec = &job.spec.storage;
+    let found = storage::storage(&context.client, &context.config.namespace, spec).await?;
+    let credentials = storage::credentials(&context.client, namespace, spec).await?;
+    let depot = found.depot(None, &credentials).map_err(|e| StorageError::Missing(e.to_string()))?;
+    Ok((found, depot))
+}
+
+/// Makes and deletes pods so that each worker has one, and notes whose tokens count.
+async fn keep_pods(
+    job: &RenderJobObject,
+    context: &Context,
+    namespace: &str,
+    uid: &str,
+    running: &Running,
+) -> Result<(), Error> {
+    let pods: Api<Pod> = Api::namespaced(context.client.clone(), namespace);
+    let found = list_pods(&pods, uid).await?;
+    let (held, prepared) = {
+        let state = running.lock();
+        (state.held.clone(), state.scene.is_some())
+    };
+    // until it is known where the scene's blocks are, one worker prepares it
+    let wanted = if prepared { build::slots(job).len() as u32 } else { 1 };
+    let plan = build::plan(&job.name_any(), &found, wanted);
+    {
+        let living = found.iter().filter(|p| p.metadata.deletion_timestamp.is_none());
+        let by_uid = living.filter_map(|p| Some((p.metadata.uid.clone()?, build::number(p)?)));
+        running.lock().pods = by_uid.collect();
+    }
+    for name in &plan.delete {
+        delete_pod(&pods, name).await?;
+    }
+    for (number, name) in &plan.make {
+        let pod = build::pod(job, &context.config, &running.storage, &held, *number, name)
+            .map_err(|e| Error::Internal(e.to_string()))?;
+        let params = PatchParams::apply(MANAGER);
+        let made = pods.patch(name, &params, &Patch::Apply(&pod)).await.map_err(api("make a worker's pod"))?;
+        if let Some(uid) = made.metadata.uid {
+            running.lock().pods.insert(uid, *number);
+        }
+    }
+    Ok(())
+}
+
+async fn list_pods(pods: &Api<Pod>, uid: &str) -> Result<Vec<Pod>, Error> {
+    let params = ListParams::default().labels(&format!("{}={uid}", build::LABEL));
+    Ok(pods.list(&params).await.map_err(api("list the workers' pods"))?.items)
+}
+
+async fn delete_pod(pods: &Api<Pod>, name: &str) -> Result<(), Error> {
+    match pods.delete(name, &DeleteParams::default()).await {
+        Ok(_) => Ok(()),
+        Err(kube::Error::Api(e)) if e.code == 404 => Ok(()),
+        Err(e) => Err(api("delete a worker's pod")(e)),
+    }
+}
+
+async fn remove_pods(job: &RenderJobObject, context: &Context, namespace: &str, uid: &str) -> Result<(), Error> {
+    let pods: Api<Pod> = Api::namespaced(context.client.clone(), namespace);
+    context.metrics.forget(namespace, &job.name_any());
+    for pod in list_pods(&pods, uid).await? {
+        if pod.metadata.deletion_timestamp.is_none() {
+            delete_pod(&pods, &pod.name_any()).await?;
+        }
+    }
+    Ok(())
+}
+
+/// Writes the status, if it says something new.
+async fn tell(job: &RenderJobObject, jobs: &Api<RenderJobObject>, status: RenderJobStatus) -> Result<(), Error> {
+    let known = job.status.clone().map(|s| RenderJobStatus { ledger: Vec::new(), ..s });
+    if known.as_ref() == Some(&status) {
+        return Ok(());
+    }
+    let patch = json!({
+        "apiVersion": rayherd_api::API_VERSION,
+        "kind": rayherd_api::KIND,
+        "status": status,
+    });
+    let params = PatchParams::apply(MANAGER).force();
+    match jobs.patch_status(&job.name_any(), &params, &Patch::Apply(&patch)).await {
+        Ok(_) => Ok(()),
+        Err(kube::Error::Api(e)) if e.code == 404 => Ok(()),
+        Err(e) => Err(api("write the status")(e)),
+    }
+}
+
+/// The job is being deleted: its thread ends, its objects go, the finalizer last.
+async fn delete(
+    job: &RenderJobObject,
+    context: &Context,
+    jobs: &Api<RenderJobObject>,
+    uid: &str,
+) -> Result<Action, Error> {
+    let finalizers = job.metadata.finalizers.clone().unwrap_or_default();
+    if !finalizers.iter().any(|f| f == FINALIZER) {
+        context.jobs.remove(uid);
+        return Ok(Action::await_change());
+    }
+    if let Some(running) = context.jobs.get(uid) {
+        running.fleet.cancel("the job is deleted");
+        running.fleet.end();
+        if !running.is_over() {
+            return Ok(Action::requeue(Duration::from_millis(200)));
+        }
+        context.jobs.remove(uid);
+    }
+    let namespace = job.namespace().unwrap_or_default();
+    context.metrics.forget(&namespace, &job.name_any());
+    match depot(context, job, &namespace).await {
+        Ok((_, depot)) => finish::clean(&depot, uid).await.map_err(|e| Error::Clean(e.to_string()))?,
+        // without its storage nothing can be deleted there, ever: the job must not stay for that
+        Err(Error::Storage(e @ StorageError::Missing(_))) => {
+            tracing::warn!(job = %job.name_any(), "objects of the deleted job may be left in its storage: {e}");
+        }
+        Err(e) => return Err(e),
+    }
+    let left: Vec<String> = finalizers.into_iter().filter(|f| f != FINALIZER).collect();
+    let patch = json!({"metadata": {"resourceVersion": job.metadata.resource_version, "finalizers": left}});
+    match jobs.patch(&job.name_any(), &PatchParams::default(), &Patch::Merge(&patch)).await {
+        Ok(_) => Ok(Action::await_change()),
+        Err(kube::Error::Api(e)) if e.code == 404 => Ok(Action::await_change()),
+        Err(e) => Err(api("let the deleted job go")(e)),
+    }
+}

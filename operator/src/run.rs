@@ -1,0 +1,140 @@
+//! A job's thread: runs the loop over rounds, and tells how far it is.
+
+use std::sync::Arc;
+use std::thread;
+
+use k8s_openapi::jiff::Timestamp;
+use kube::Client;
+use rayherd_api::ByteSize;
+use rayherd_api::resource::RenderJobObject;
+use rayherd_herd::job::{JobError, Progress, Status};
+use rayherd_herd::remote::frames::{Job, Keeper, run};
+use rayherd_herd::remote::{Depot, Fleet, Storage};
+use rayherd_herd::report::Report;
+use rayherd_scene::objects::ObjectRef;
+use tokio::runtime::Handle;
+
+use crate::build;
+use crate::jobs::{Problem, Running, State};
+use crate::ledger::Ledger;
+
+/// Where a job's own objects are.
+pub fn prefix(uid: &str) -> String {
+    format!("jobs/{uid}")
+}
+
+/// Keys of the pictures: one for each frame.
+pub fn pictures(job: &RenderJobObject) -> Vec<String> {
+    let name = job.metadata.name.clone().unwrap_or_default();
+    let namespace = job.metadata.namespace.clone().unwrap_or_default();
+    let file = job.spec.image.output.clone().unwrap_or_else(|| format!("{name}.exr"));
+    let cameras = &job.spec.image.cameras;
+    let path = |file: &str| format!("output/{namespace}/{name}/{file}");
+    if cameras.len() < 2 {
+        return vec![path(&file)];
+    }
+    let stem = file.strip_suffix(".exr").unwrap_or(&file);
+    let numbered = cameras.iter().enumerate().map(|(i, c)| {
+        let mark = c.name.clone().unwrap_or_else(|| format!("{:04}", i + 1));
+        path(&format!("{stem}-{mark}.exr"))
+    });
+    numbered.collect()
+}
+
+/// Starts a job.
+pub fn start(client: Client, job: Arc<RenderJobObject>, storage: Storage, depot: Depot) -> Arc<Running> {
+    let nanos = Timestamp::now().as_nanosecond();
+    let slots = build::slots(&job);
+    let session = format!("o{nanos:x}");
+    let running = Arc::new(Running {
+        generation: job.metadata.generation.unwrap_or(0),
+        fleet: Fleet::new(slots.len() as u32, &session),
+        storage,
+        state: State { started: Some(Timestamp::now()), ..State::default() }.into(),
+    });
+    let keeper = Kept { ledger: Ledger::new(client, &job, Handle::current()), running: running.clone() };
+    let runtime = Handle::current();
+    let of_thread = running.clone();
+    let name = job.metadata.name.clone().unwrap_or_default();
+    let work = move || {
+        let mut spec = job.spec.clone();
+        spec.workers.memory = Some(ByteSize::new(build::memory(&job)));
+        let task = Job {
+            spec: &spec,
+            pictures: pictures(&job),
+            prefix: prefix(job.metadata.uid.as_deref().unwrap_or_default()),
+            session,
+            depot: &depot,
+            fleet: &of_thread.fleet,
+            slots,
+            runtime,
+        };
+        let keeper: Arc<dyn Keeper> = Arc::new(keeper);
+        let watch = Watch(of_thread.clone(), job.metadata.name.clone().unwrap_or_default());
+        let caught = std::panic::catch_unwind(std::panic::AssertUnwindSafe(|| run(&task, &keeper, &watch)));
+        let result = caught.unwrap_or_else(|_| Err(JobError::Internal("the job's thread panicked".into())));
+        let result = result.map_err(|e| Problem { stopped: matches!(e, JobError::Owned(_)), message: e.to_string() });
+        if let Err(problem) = &result {
+            tracing::warn!(job = %job.metadata.name.clone().unwrap_or_default(), "{}", problem.message);
+        }
+        // workers of a job that was stopped wait for whoever goes on with it
+        if result.as_ref().is_ok_and(|()| true) || result.as_ref().is_err_and(|p| !p.stopped) {
+            of_thread.fleet.end();
+        }
+        of_thread.lock().end = Some((Timestamp::now(), result));
+    };
+    if let Err(e) = thread::Builder::new().name(format!("job {name}")).spawn(work) {
+        let problem = Problem { message: format!("no thread for the job: {e}"), stopped: true };
+        running.lock().end = Some((Timestamp::now(), Err(problem)));
+    }
+    running
+}
+
+struct Kept {
+    ledger: Ledger,
+    running: Arc<Running>,
+}
+
+impl Keeper for Kept {
+    fn newest(&self, frame: u32) -> Option<(u64, String)> {
+        self.ledger.newest(frame)
+    }
+    fn move_to(&self, frame: u32, sequence: u64, name: &str) -> Result<(), JobError> {
+        self.ledger.move_to(frame, sequence, name)
+    }
+    fn prepared(&self, scene: &ObjectRef, reused: bool) {
+        let mut state = self.running.lock();
+        (state.scene, state.reused) = (Some(scene.hash.to_string()), reused);
+    }
+    fn placed(&self, bytes: &[u64]) {
+        let mut state = self.running.lock();
+        for (endpoint, bytes) in self.running.storage.endpoints.iter().zip(bytes) {
+            if let Some(node) = &endpoint.node {
+                *state.held.entry(node.clone()).or_default() += bytes;
+            }
+        }
+    }
+    fn done(&self, _: u32, picture: &[String], report: &Report) {
+        let mut state = self.running.lock();
+        // one address of each picture is enough
+        state.pictures.extend(picture.first().cloned());
+        state.reports.push(report.clone());
+    }
+}
+
+struct Watch(Arc<Running>, String);
+
+impl Progress for Watch {
+    fn status(&self, status: &Status) {
+        let first = self.0.fleet.tally().first_attempt;
+        let mut state = self.0.lock();
+        state.status = *status;
+        if state.first_task.is_none()
+            && let Some(at) = first
+        {
+            state.first_task = Timestamp::now().checked_sub(at.elapsed()).ok();
+            let began = state.started.map(|t| t.duration_until(Timestamp::now()));
+            tracing::info!(job = self.1, ?began, "the first task was handed out");
+        }
+    }
+}

@@ -1,0 +1,150 @@
+//! The storage of a job: its profile, its servers and the nodes they are on, its credentials.
+
+use std::collections::BTreeMap;
+
+use k8s_openapi::ByteString;
+use k8s_openapi::api::core::v1::{ConfigMap, Secret};
+use k8s_openapi::api::discovery::v1::EndpointSlice;
+use kube::api::ListParams;
+use kube::{Api, Client};
+use rayherd_api::StorageSpec;
+use rayherd_herd::remote::{Endpoint, Storage};
+use rayherd_herd::store::S3Credentials;
+use serde::Deserialize;
+
+/// Why the storage cannot be used (yet).
+#[derive(Debug, thiserror::Error)]
+pub enum StorageError {
+    /// Something that it names is not there.
+    #[error("{0}")]
+    Missing(String),
+    /// The API server did not answer, or refused.
+    #[error("cannot read {what}: {source}")]
+    Api {
+        /// What was read.
+        what: String,
+        /// Why not.
+        source: kube::Error,
+    },
+}
+
+/// A profile, as it stands in a ConfigMap under `profile.yaml`.
+#[derive(Clone, Debug, Deserialize)]
+#[serde(rename_all = "camelCase", deny_unknown_fields)]
+struct Profile {
+    bucket: String,
+    #[serde(default)]
+    prefix: String,
+    #[serde(default)]
+    region: Option<String>,
+    /// A headless service of a StatefulSet of the same name.
+    #[serde(default)]
+    service: Option<Service>,
+    /// Servers by address.
+    #[serde(default)]
+    endpoints: Vec<Endpoint>,
+}
+
+#[derive(Clone, Debug, Deserialize)]
+#[serde(rename_all = "camelCase", deny_unknown_fields)]
+struct Service {
+    namespace: String,
+    name: String,
+    #[serde(default = "default_port")]
+    port: u16,
+    /// How many; each keeps its number, there or not.
+    servers: u32,
+}
+
+fn default_port() -> u16 {
+    9000
+}
+
+/// Name of a profile's ConfigMap.
+pub fn profile_name(spec: &StorageSpec) -> String {
+    format!("rayherd-storage-{}", spec.profile.as_deref().unwrap_or("default"))
+}
+/// Name of a job's Secret.
+pub fn secret_name(spec: &StorageSpec) -> String {
+    spec.secret.clone().unwrap_or_else(|| "rayherd-storage".into())
+}
+
+/// Finds out the storage of a job.
+pub async fn storage(client: &Client, own: &str, spec: &StorageSpec) -> Result<Storage, StorageError> {
+    let name = profile_name(spec);
+    let what = format!("ConfigMap {own}/{name}");
+    let maps: Api<ConfigMap> = Api::namespaced(client.clone(), own);
+    let map = maps.get_opt(&name).await.map_err(|source| StorageError::Api { what: what.clone(), source })?;
+    let missing = |why: &str| StorageError::Missing(format!("{what} {why}"));
+    let map = map.ok_or_else(|| missing("is not there: name another spec.storage.profile, or make it"))?;
+    let text = map.data.unwrap_or_default().remove("profile.yaml").ok_or_else(|| missing("has no profile.yaml"))?;
+    let profile: Profile =
+        serde_yaml::from_str(&text).map_err(|e| missing(&format!("cannot be read: profile.yaml: {e}")))?;
+    let mut endpoints = profile.endpoints.clone();
+    if let Some(service) = &profile.service {
+        let what = format!("EndpointSlices of {}/{}", service.namespace, service.name);
+        let slices: Api<EndpointSlice> = Api::namespaced(client.clone(), &service.namespace);
+        let params = ListParams::default().labels(&format!("kubernetes.io/service-name={}", service.name));
+        let slices = slices.list(&params).await.map_err(|source| StorageError::Api { what, source })?;
+        endpoints.extend(servers(&slices.items, service));
+    }
+    if endpoints.is_empty() {
+        return Err(missing("names no server that is there"));
+    }
+    let region = profile.region.unwrap_or_else(|| "us-east-1".into());
+    Ok(Storage { bucket: profile.bucket, prefix: profile.prefix, region, endpoints })
+}
+
+/// The servers of a StatefulSet in the order of their numbers, with the nodes that they run on now. One that is away has its place
+/// all the same: it may be back, and what the others hold must not be looked for elsewhere meanwhile.
+fn servers(slices: &[EndpointSlice], service: &Service) -> Vec<Endpoint> {
+    let found = slices.iter().flat_map(|s| &s.endpoints);
+    let nodes: BTreeMap<&str, &str> =
+        found.filter_map(|e| Some((e.hostname.as_deref()?, e.node_name.as_deref()?))).collect();
+    let Service { namespace, name, port, servers } = service;
+    let server = |number| {
+        let host = format!("{name}-{number}");
+        let node = nodes.get(host.as_str()).map(|n| (*n).to_owned());
+        Endpoint { url: format!("http://{host}.{name}.{namespace}.svc:{port}"), node }
+    };
+    (0..*servers).map(server).collect()
+}
+
+/// The credentials of a job.
+pub async fn credentials(client: &Client, namespace: &str, spec: &StorageSpec) -> Result<S3Credentials, StorageError> {
+    let name = secret_name(spec);
+    let what = format!("Secret {namespace}/{name}");
+    let secrets: Api<Secret> = Api::namespaced(client.clone(), namespace);
+    let secret = secrets.get_opt(&name).await.map_err(|source| StorageError::Api { what: what.clone(), source })?;
+    let missing = |why: &str| StorageError::Missing(format!("{what} {why}"));
+    let secret = secret.ok_or_else(|| missing("is not there: make it, or name another spec.storage.secret"))?;
+    let data = secret.data.unwrap_or_default();
+    let text = |key: &str| data.get(key).and_then(|ByteString(b)| String::from_utf8(b.clone()).ok());
+    let need = |key: &str| text(key).ok_or_else(|| missing(&format!("has no {key}")));
+    Ok(S3Credentials {
+        access_key: need("AWS_ACCESS_KEY_ID")?,
+        secret_key: need("AWS_SECRET_ACCESS_KEY")?,
+        session_token: text("AWS_SESSION_TOKEN"),
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use serde_json::json;
+
+    use super::*;
+
+    #[test]
+    fn servers_keep_their_numbers() {
+        let endpoint = |host: &str, node: &str| json!({"addresses": ["10.0.0.1"], "hostname": host, "nodeName": node});
+        let slice = |endpoints: Vec<serde_json::Value>| -> EndpointSlice {
+            serde_json::from_value(json!({"addressType": "IPv4", "metadata": {}, "endpoints": endpoints})).unwrap()
+        };
+        let slices = [slice(vec![endpoint("minio-2", "c")]), slice(vec![endpoint("minio-0", "b")])];
+        let service = Service { namespace: "store".into(), name: "minio".into(), port: 9000, servers: 3 };
+        let found = servers(&slices, &service);
+        assert_eq!(found[1].url, "http://minio-1.minio.store.svc:9000");
+        let nodes: Vec<Option<&str>> = found.iter().map(|e| e.node.as_deref()).collect();
+        assert_eq!(nodes, [Some("b"), None, Some("c")]);
+    }
+}

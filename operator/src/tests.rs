@@ -1,0 +1,277 @@
+//! Reconciling against a mock API server: each request is asserted, and silence too.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use hyper::{Request, Response};
+use kube::Client;
+use kube::client::Body;
+use kube::runtime::controller::Action;
+use rayherd_api::resource::RenderJobObject;
+use rayherd_herd::job::JobError;
+use serde_json::{Value, json};
+use tokio::runtime::Handle;
+use tower_test::mock::{self, Handle as Mock};
+
+use crate::config::Config;
+use crate::ledger::Ledger;
+use crate::reconcile::{Context, FINALIZER, reconcile};
+
+/// One request that must come, and its answer.
+struct Step {
+    method: &'static str,
+    path: &'static str,
+    /// What must be in the body, by JSON pointer.
+    body: Vec<(&'static str, Value)>,
+    status: u16,
+    answer: Value,
+}
+
+fn step(method: &'static str, path: &'static str, status: u16, answer: Value) -> Step {
+    Step { method, path, body: vec![], status, answer }
+}
+
+impl Step {
+    fn with(mut self, pointer: &'static str, value: Value) -> Self {
+        self.body.push((pointer, value));
+        self
+    }
+}
+
+type Server = Mock<Request<Body>, Response<Body>>;
+
+/// Answers these requests in their order, and sees that no other comes. What each said is handed back.
+async fn serve(mut server: Server, steps: Vec<Step>) -> Vec<Value> {
+    let mut said = Vec::new();
+    for (number, step) in steps.into_iter().enumerate() {
+        let next = tokio::time::timeout(Duration::from_secs(20), server.next_request()).await;
+        let (request, send) = next
+            .ok()
+            .flatten()
+            .unwrap_or_else(|| panic!("request {number} ({} {}) did not come", step.method, step.path));
+        let (parts, body) = request.into_parts();
+        let asked = format!("{} {}", parts.method, parts.uri);
+        assert!(
+            parts.method == step.method && parts.uri.to_string().starts_with(step.path),
+            "request {number} is {asked}, not {} {}",
+            step.method,
+            step.path
+        );
+        let bytes = body.collect_bytes().await.unwrap();
+        let body: Value = serde_json::from_slice(&bytes).unwrap_or(Value::Null);
+        for (pointer, want) in &step.body {
+            assert_eq!(body.pointer(pointer), Some(want), "{asked}: {pointer} in {body}");
+        }
+        said.push(body);
+        let answer = serde_json::to_vec(&step.answer).unwrap();
+        send.send_response(Response::builder().status(step.status).body(Body::from(answer)).unwrap());
+    }
+    let more = tokio::time::timeout(Duration::from_millis(300), server.next_request()).await;
+    if let Ok(Some((request, _))) = more {
+        panic!("one request too many: {} {}", request.method(), request.uri());
+    }
+    said
+}
+
+fn context() -> (Arc<Context>, Server) {
+    let (service, server) = mock::pair::<Request<Body>, Response<Body>>();
+    let config = Config {
+        namespace: "rayherd".into(),
+        url: "http://operator:8080".into(),
+        image: "worker:1".into(),
+        listen: "127.0.0.1:0".parse().unwrap(),
+        metrics: "127.0.0.1:0".parse().unwrap(),
+        watch: None,
+    };
+    (Arc::new(Context::new(Client::new(service, "default"), config).unwrap()), server)
+}
+
+fn job() -> Value {
+    json!({
+        "apiVersion": "rayherd.io/v1alpha1",
+        "kind": "RenderJob",
+        "metadata": {"name": "box", "namespace": "studio", "uid": "u-1", "generation": 3, "resourceVersion": "7"},
+        "spec": {"scene": {"source": "scenes/box/box.xml"}, "workers": {"nodes": 2, "slots": [1]}},
+    })
+}
+
+fn object(value: &Value) -> Arc<RenderJobObject> {
+    Arc::new(serde_json::from_value(value.clone()).unwrap())
+}
+
+fn not_found() -> Value {
+    json!({"kind": "Status", "apiVersion": "v1", "status": "Failure", "reason": "NotFound", "code": 404, "message": "none"})
+}
+
+fn conflict() -> Value {
+    json!({"kind": "Status", "apiVersion": "v1", "status": "Failure", "reason": "Conflict", "code": 409, "message": "old"})
+}
+
+fn no_pods() -> Value {
+    json!({"kind": "PodList", "apiVersion": "v1", "metadata": {}, "items": []})
+}
+
+const STATUS: &str = "/apis/rayherd.io/v1alpha1/namespaces/studio/renderjobs/box/status?";
+const JOB: &str = "/apis/rayherd.io/v1alpha1/namespaces/studio/renderjobs/box?";
+const PROFILE: &str = "/api/v1/namespaces/rayherd/configmaps/rayherd-storage-default";
+const SECRET: &str = "/api/v1/namespaces/studio/secrets/rayherd-storage";
+const PODS: &str = "/api/v1/namespaces/studio/pods?&labelSelector=rayherd.io%2Fjob%3Du-1";
+
+async fn scenario(job: &Value, steps: Vec<Step>) -> (Result<Action, String>, Vec<Value>, Arc<Context>) {
+    let (context, server) = context();
+    let serving = tokio::spawn(serve(server, steps));
+    let done = reconcile(object(job), context.clone()).await.map_err(|e| e.to_string());
+    (done, serving.await.unwrap(), context)
+}
+
+#[tokio::test]
+async fn a_bad_job_fails_with_what_to_do_and_nothing_is_made() {
+    let mut bad = job();
+    bad["spec"]["sampling"] = json!({"spp": 0});
+    let tell = step("PATCH", STATUS, 200, bad.clone())
+        .with("/status/phase", json!("Failed"))
+        .with("/status/observedGeneration", json!(3))
+        .with("/status/conditions/0/status", json!("False"));
+    let (done, said, _) = scenario(&bad, vec![tell]).await;
+    assert_eq!(done, Ok(Action::await_change()));
+    assert!(said[0].to_string().contains("spec.sampling.spp: is 0"), "{}", said[0]);
+    // told once: the same again is silence but for a look at what pods are left
+    let mut told = bad.clone();
+    told["status"] = said[0]["status"].clone();
+    let (done, ..) = scenario(&told, vec![step("GET", PODS, 200, no_pods())]).await;
+    assert_eq!(done, Ok(Action::await_change()));
+}
+
+#[tokio::test]
+async fn a_job_without_its_storage_waits_and_says_for_what() {
+    let tell = step("PATCH", STATUS, 200, job()).with("/status/phase", json!("Pending"));
+    let (done, said, _) = scenario(&job(), vec![step("GET", PROFILE, 404, not_found()), tell]).await;
+    assert_ne!(done.unwrap(), Action::await_change());
+    assert!(said[1].to_string().contains("rayherd-storage-default is not there"), "{}", said[1]);
+    let mut told = job();
+    told["status"] = said[1]["status"].clone();
+    let (done, ..) = scenario(&told, vec![step("GET", PROFILE, 404, not_found())]).await;
+    assert_ne!(done.unwrap(), Action::await_change(), "told once, and looked at again");
+}
+
+#[tokio::test]
+async fn an_api_server_that_fails_is_an_error_to_try_again() {
+    let failure = json!({"kind": "Status", "apiVersion": "v1", "status": "Failure", "reason": "InternalError", "code": 500, "message": "etcd"});
+    let (done, ..) = scenario(&job(), vec![step("GET", PROFILE, 500, failure)]).await;
+    assert!(done.unwrap_err().contains("cannot read ConfigMap"));
+}
+
+#[tokio::test]
+async fn a_good_job_gets_its_finalizer_then_one_worker_that_prepares() {
+    let profile = json!({
+        "metadata": {"name": "rayherd-storage-default"},
+        "data": {"profile.yaml": "bucket: herd\nendpoints: [{url: 'http://127.0.0.1:1', node: node1}]"},
+    });
+    let secret = json!({"metadata": {"name": "rayherd-storage"}, "data": {"AWS_ACCESS_KEY_ID": "YQ==", "AWS_SECRET_ACCESS_KEY": "Yg=="}});
+    let mut with_finalizer = job();
+    with_finalizer["metadata"]["finalizers"] = json!([FINALIZER]);
+    let pod = json!({"metadata": {"name": "box-w0", "uid": "p-0", "labels": {"rayherd.io/worker": "0"}}});
+    let steps = vec![
+        step("GET", PROFILE, 200, profile),
+        step("GET", SECRET, 200, secret),
+        step("PATCH", JOB, 200, with_finalizer.clone())
+            .with("/metadata/finalizers", json!([FINALIZER]))
+            .with("/metadata/resourceVersion", json!("7")),
+        step("GET", PODS, 200, no_pods()),
+        step("PATCH", "/api/v1/namespaces/studio/pods/box-w0?", 201, pod.clone())
+            .with("/metadata/ownerReferences/0/uid", json!("u-1"))
+            .with("/spec/automountServiceAccountToken", json!(false)),
+        step("PATCH", STATUS, 200, with_finalizer.clone())
+            .with("/status/phase", json!("Pending"))
+            .with("/status/workers", json!("0/2")),
+    ];
+    let (done, said, context) = scenario(&job(), steps).await;
+    assert_ne!(done.unwrap(), Action::await_change());
+    assert!(said[5]["status"].get("ledger").is_none(), "the pointers belong to another manager");
+    let running = context.jobs.get("u-1").expect("it runs");
+    assert_eq!(running.lock().pods.get("p-0"), Some(&0), "its token counts");
+    running.fleet.cancel("the test is over");
+}
+
+#[tokio::test]
+async fn a_finished_job_loses_its_workers_and_then_there_is_silence() {
+    let mut finished = job();
+    finished["status"] = json!({"phase": "Complete", "observedGeneration": 3});
+    let pods = json!({"kind": "PodList", "apiVersion": "v1", "metadata": {}, "items": [
+        {"metadata": {"name": "box-w0", "labels": {"rayherd.io/worker": "0"}}},
+        {"metadata": {"name": "box-w1", "deletionTimestamp": "2026-01-01T00:00:00Z"}},
+    ]});
+    let pod = json!({"kind": "Pod", "apiVersion": "v1", "metadata": {"name": "box-w0"}});
+    let steps = vec![step("GET", PODS, 200, pods), step("DELETE", "/api/v1/namespaces/studio/pods/box-w0?", 200, pod)];
+    let (done, ..) = scenario(&finished, steps).await;
+    assert_eq!(done, Ok(Action::await_change()));
+    let (done, ..) = scenario(&finished, vec![step("GET", PODS, 200, no_pods())]).await;
+    assert_eq!(done, Ok(Action::await_change()), "nothing is written");
+}
+
+#[tokio::test]
+async fn a_deleted_job_goes_even_when_its_storage_went_first() {
+    let mut deleted = job();
+    deleted["metadata"]["deletionTimestamp"] = json!("2026-01-01T00:00:00Z");
+    let (done, ..) = scenario(&deleted, vec![]).await;
+    assert_eq!(done, Ok(Action::await_change()), "it is not ours any more");
+    deleted["metadata"]["finalizers"] = json!(["other/one", FINALIZER]);
+    let steps = vec![
+        step("GET", PROFILE, 404, not_found()),
+        step("PATCH", JOB, 200, deleted.clone()).with("/metadata/finalizers", json!(["other/one"])),
+    ];
+    let (done, ..) = scenario(&deleted, steps).await;
+    assert_eq!(done, Ok(Action::await_change()));
+}
+
+/// Runs a move of the pointer against a script.
+async fn moved(steps: Vec<Step>) -> (Result<(), JobError>, Option<(u64, String)>) {
+    let (service, server) = mock::pair::<Request<Body>, Response<Body>>();
+    let client = Client::new(service, "default");
+    let mut known = job();
+    known["status"] = json!({"ledger": [{"frame": 0, "sequence": 4, "record": "four"}]});
+    let ledger = Arc::new(Ledger::new(client, &object(&known), Handle::current()));
+    let serving = tokio::spawn(serve(server, steps));
+    let of_thread = ledger.clone();
+    let result = tokio::task::spawn_blocking(move || of_thread.move_to(0, 5, "five")).await.unwrap();
+    serving.await.unwrap();
+    (result, ledger.newest(0))
+}
+
+fn at(sequence: i64, record: &str, version: &str) -> Value {
+    let mut job = job();
+    job["metadata"]["resourceVersion"] = json!(version);
+    job["status"] = json!({"ledger": [{"frame": 0, "sequence": sequence, "record": record}]});
+    job
+}
+
+const GET_JOB: &str = "/apis/rayherd.io/v1alpha1/namespaces/studio/renderjobs/box";
+
+#[tokio::test]
+async fn the_ledger_moves_only_from_where_this_operator_left_it() {
+    let write = |version: &'static str, status, answer| {
+        step("PATCH", STATUS, status, answer)
+            .with("/metadata/resourceVersion", json!(version))
+            .with("/status/ledger/0/record", json!("five"))
+    };
+    let five = Some((5, "five".to_owned()));
+    let (done, newest) = moved(vec![write("7", 200, at(5, "five", "8"))]).await;
+    assert!(done.is_ok() && newest == five);
+    // somebody wrote another part of the status
+    let again = vec![
+        write("7", 409, conflict()),
+        step("GET", GET_JOB, 200, at(4, "four", "9")),
+        write("9", 200, at(5, "five", "10")),
+    ];
+    let (done, newest) = moved(again).await;
+    assert!(done.is_ok() && newest == five);
+    // the write was done, its answer lost
+    let (done, newest) = moved(vec![write("7", 409, conflict()), step("GET", GET_JOB, 200, at(5, "five", "9"))]).await;
+    assert!(done.is_ok() && newest == five);
+    // another operator went on
+    let (done, newest) = moved(vec![write("7", 409, conflict()), step("GET", GET_JOB, 200, at(5, "other", "9"))]).await;
+    assert!(matches!(done, Err(JobError::Owned(_))), "{done:?}");
+    assert_eq!(newest, Some((4, "four".to_owned())));
+    let (done, _) = moved(vec![write("7", 404, not_found())]).await;
+    assert!(matches!(done, Err(JobError::Owned(_))), "{done:?}");
+}
