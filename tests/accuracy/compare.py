@@ -27,13 +27,11 @@ def main() -> int:
     p.add_argument("--shared", type=Path, required=True)
     p.add_argument("--work", type=Path, required=True)
     p.add_argument("--size", type=int, default=128)
-    p.add_argument("--spp", type=int, default=256)
-    p.add_argument("--renders", type=int, default=16)
+    p.add_argument("--spp", type=int, help="of one render; by default what the scene needs, 256 for most")
+    p.add_argument("--renders", type=int, help="by default what the scene needs, 16 for most")
     p.add_argument("--max-depth", type=int, default=8)
     p.add_argument("--quick", action="store_true", help="fewer samples: finds gross errors only")
     a = p.parse_args()
-    if a.quick:
-        a.spp, a.renders = 64, 8
     a.work.mkdir(parents=True, exist_ok=True)
 
     import mitsuba as mi
@@ -45,11 +43,13 @@ def main() -> int:
     for name in names:
         xml = scenes.prepare(name, a.shared.resolve(), a.work.resolve())
         scene = mi.load_file(str(xml), **scenes.parameters(xml, a.size, a.max_depth))
+        spp, renders = (64, 8) if a.quick else scenes.ENOUGH.get(name, (256, 16))
+        spp, renders = a.spp or spp, a.renders or renders
         theirs, ours = [], []
-        for i in range(a.renders):
-            theirs.append(np.array(mi.render(scene, spp=a.spp, seed=1000 + i), dtype=np.float64))
+        for i in range(renders):
+            theirs.append(np.array(mi.render(scene, spp=spp, seed=1000 + i), dtype=np.float64))
             out = a.work / f"{name}-{i}.exr"
-            command = [a.rayherd, "render", str(xml), "--size", f"{a.size}x{a.size}", "--spp", str(a.spp), "--seed", str(i),
+            command = [a.rayherd, "render", str(xml), "--size", f"{a.size}x{a.size}", "--spp", str(spp), "--seed", str(i),
                        "--max-depth", str(a.max_depth), "-o", str(out)]
             subprocess.run(command, check=True, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
             image = np.array(mi.Bitmap(str(out)), dtype=np.float64)[..., :3]

@@ -14,7 +14,7 @@ use rayherd_scene::import::{ImportOptions, Survey, import};
 use super::{print, size};
 use crate::options::{self, SceneOptions};
 
-/// Say what a scene holds, what of it is not supported and what is missing; nothing is prepared or rendered
+/// Say what a scene holds and what of it is not supported; render nothing
 ///
 /// Exits with 2 when something is unsupported (each named with file and line; with --substitute that is allowed) or cannot be read.
 #[derive(Args)]
