@@ -1,5 +1,8 @@
 //! The `RenderJob`: what to render, how well, and on what.
 
+// a resource has one `printcolumn` for each column, and their types repeat
+#![allow(clippy::duplicated_attributes)]
+
 use std::collections::BTreeMap;
 
 use schemars::JsonSchema;

@@ -67,9 +67,12 @@ pub struct Part {
     shared: NodeView,
 }
 
+/// One store, and a key there.
+type Alone<'s, 'k> = (&'s Arc<dyn BlockStore>, &'k str);
+
 impl Part {
     /// The store that a key lies on alone, and its key there.
-    fn alone<'k>(&self, key: &'k str) -> Result<Option<(&Arc<dyn BlockStore>, &'k str)>, StoreError> {
+    fn alone<'k>(&self, key: &'k str) -> Result<Option<Alone<'_, 'k>>, StoreError> {
         let Some((number, rest)) = key.strip_prefix("nodes/").and_then(|k| k.split_once('/')) else { return Ok(None) };
         let store = number.parse().ok().and_then(|n: usize| self.stores.get(n));
         let none = || StoreError::InvalidKey { key: key.to_owned(), message: "there is no such node".into() };

@@ -14,6 +14,9 @@ pub struct Parts<'f> {
     settled: Vec<FilmRef>,
 }
 
+/// The film, its estimated relMSE, and the keys of the picture's files.
+type Merged = (Option<FilmRef>, Option<f64>, Vec<String>);
+
 impl<'f> Parts<'f> {
     /// A film whose parts are these; `settled` is what to go back to.
     pub fn new(fleet: &'f Fleet, now: Vec<FilmRef>, settled: Vec<FilmRef>) -> Self {
@@ -21,12 +24,7 @@ impl<'f> Parts<'f> {
     }
 
     /// Has the parts added up.
-    pub fn merge(
-        &self,
-        name: Option<&str>,
-        spp: u32,
-        picture: Option<String>,
-    ) -> Result<(Option<FilmRef>, Option<f64>, Vec<String>), JobError> {
+    pub fn merge(&self, name: Option<&str>, spp: u32, picture: Option<String>) -> Result<Merged, JobError> {
         let work = Work::Merge { name: name.map(str::to_owned), parts: self.now.clone(), spp, picture };
         match self.fleet.call(work)? {
             Done::Merged { film, rel_mse, picture } => Ok((film, rel_mse, picture)),
