@@ -1,4 +1,5 @@
-//! A schedule of faults, a function of its seed: the same seed makes the same faults befall the same attempts.
+//! A schedule of faults, a function of its seed: attempts are counted in the order in which they start, so where threads decide that order a seed gives the
+//! same mixture of faults, not the same run.
 
 use std::time::Duration;
 

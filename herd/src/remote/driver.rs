@@ -228,13 +228,14 @@ impl<'s, 'a, F: FilmSum> Driver<'s, 'a, F> {
         let Some(limit) = self.sampling.time_limit else { return end };
         let elapsed = self.start.elapsed().as_secs_f64();
         if !self.begun || elapsed <= 0.0 {
-            return end;
+            // one sample, to learn how long it takes
+            return end.min(self.queued.saturating_add(1)).max(reach);
         }
         let [w, h] = self.shared.frame.size;
         let camera = self.ledger.rays().camera.saturating_sub(self.taken_over.camera);
         let made = camera as f64 / (f64::from(w) * f64::from(h));
         let samples_left = made / elapsed * (limit - elapsed).max(0.0);
-        end.min(self.queued + (samples_left as u32).max(1)).max(reach)
+        end.min(self.queued.saturating_add((samples_left as u32).max(1))).max(reach)
     }
 
     /// Whether everything queued came to its end.
@@ -416,6 +417,11 @@ impl<'s, 'a, F: FilmSum> Driver<'s, 'a, F> {
             // what a task that does not run any more read may be gone by right
             Err(e @ JobError::Lost { .. }) if self.running.contains_key(&task) => return self.go_back(&e),
             Err(JobError::Lost { .. }) => return Ok(()),
+            // another attempt has done the work
+            Err(e) if !self.running.contains_key(&task) && !matches!(e, JobError::Internal(_)) => {
+                tracing::warn!("a second attempt failed after the first was committed: {e}");
+                return Ok(());
+            }
             Err(e) => return Err(e),
         };
         self.commit(task, number, made, cpu)

@@ -1,8 +1,7 @@
 //! A small tree over boxes that are no triangles: the opened nodes of the splits in memory.
 //!
-//! obvhs builds it (PLOC, Meister and Bittner 2018, then reinsertion, Meister and Bittner 2018b), which is some per cent better than binning where boxes overlap
-//! as those of splits do. Over flat regular grids (walls, height fields) its trees are terrible, so the binned tree is built too, and the one of
-//! less expected work is kept.
+//! obvhs builds it (PLOC and reinsertion). Over flat regular grids (walls, height fields) its trees are terrible, so the binned tree is built too, and
+//! the one of less expected work is kept.
 
 use glam::Vec3A;
 use obvhs::BvhBuildParams;
