@@ -137,7 +137,11 @@ fn only_the_operator_knows_kubernetes() {
 #[test]
 fn the_operator_reads_no_rays_and_no_film() {
     let words = ["ray_group", "FilmPart", "decode_film", "codec", "attempt::run"];
-    let files: Vec<_> = sources("operator/src").into_iter().chain(sources("herd/src/remote")).collect();
+    let files: Vec<_> = sources("operator/src")
+        .into_iter()
+        .chain(sources("herd/src/remote"))
+        .chain(sources("herd/src/driver"))
+        .collect();
     let of_workers =
         |p: &str| p.ends_with("remote/station.rs") || p.ends_with("remote/tests.rs") || p.ends_with("remote/fleet.rs");
     let files: Vec<_> = files.into_iter().filter(|(p, _)| !of_workers(p)).collect();

@@ -46,7 +46,7 @@ pub fn run(arguments: &Arguments) -> anyhow::Result<ExitCode> {
     }
     let mut total = Collected::default();
     for job in jobs {
-        let done = store.wait(collect(store.part(&job)?.as_ref())).with_context(|| format!("cannot collect {job}"))?;
+        let done = store.wait(collect(store.part(&job)?)).with_context(|| format!("cannot collect {job}"))?;
         total.objects += done.objects;
         total.bytes += done.bytes;
         total.kept += done.kept;

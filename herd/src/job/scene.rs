@@ -66,6 +66,16 @@ impl PreparedScene {
         let boxes: Vec<_> = owning.iter().map(entry).map(|s| (s.lo, s.hi)).collect();
         place::order(&boxes).into_iter().map(|i| owning[i as usize]).collect()
     }
+    /// Names what defines an image: the scene's content and the frame.
+    ///
+    /// # Errors
+    /// When the frame cannot be written down, which is a mistake of Rayherd.
+    pub fn image_name(&self, frame: &Frame) -> Result<String, JobError> {
+        let frame = serde_json::to_vec(frame).map_err(|e| JobError::Internal(e.to_string()))?;
+        let mut hasher = blake3::Hasher::new();
+        hasher.update(b"rayherd image 1\0").update(&self.manifest.content.0).update(&frame);
+        Ok(hasher.finalize().to_hex().to_string())
+    }
     /// What every path of a frame shares.
     pub fn context<'a>(&'a self, frame: &'a Frame) -> Context<'a> {
         Context { world: &self.world, lights: &self.lights, frame }

@@ -38,6 +38,7 @@ pub struct Attempt {
 }
 
 /// What an attempt made.
+#[derive(Clone)]
 pub struct Made {
     /// To be committed.
     pub outputs: Outputs,

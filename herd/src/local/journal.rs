@@ -1,6 +1,7 @@
 //! The chain of round records in a store: written before a commit counts, read to go on.
 
 use std::collections::BTreeMap;
+use std::sync::Arc;
 
 use bytes::Bytes;
 use rayherd_render::film::FilmPart;
@@ -26,8 +27,8 @@ pub struct Resumed {
     pub ledger: Ledger,
     /// Sum of all committed film parts.
     pub film: FilmPart,
-    /// The last state without rays on their way, if any; rays that are lost later lead back to it.
-    pub settled: Option<(Snapshot, FilmPart)>,
+    /// The last state without rays on their way; rays that are lost later lead back to it.
+    pub settled: (Snapshot, FilmPart),
     /// Commits taken over.
     pub reused: u64,
     /// Commits whose outputs are lost: to be computed again.
@@ -105,7 +106,7 @@ pub fn resume(nodes: &Nodes, image: &str, tiles: u32, size: [u32; 2]) -> Result<
         );
     }
     let (mut ledger, mut film) = (Ledger::new(image, tiles), FilmPart::new(size));
-    let mut settled = None;
+    let mut settled = (ledger.snapshot(None), film.clone());
     let mut lost = None;
     for (name, record) in &chain.records {
         ledger.replay(record, name.clone())?;
@@ -116,7 +117,7 @@ pub fn resume(nodes: &Nodes, image: &str, tiles: u32, size: [u32; 2]) -> Result<
                 parts = snapshot.film.iter().collect();
             }
             match parts.into_iter().try_for_each(|part| merge(nodes, &mut film, part, size)) {
-                Ok(()) if ledger.is_settled() => settled = Some((ledger.snapshot(None), film.clone())),
+                Ok(()) if ledger.is_settled() => settled = (ledger.snapshot(None), film.clone()),
                 Ok(()) => {}
                 Err(e @ JobError::Lost { .. }) => lost = Some(e),
                 Err(e) => return Err(e),
@@ -134,14 +135,13 @@ pub fn resume(nodes: &Nodes, image: &str, tiles: u32, size: [u32; 2]) -> Result<
         return Err(why);
     }
     tracing::warn!("{why}; what was committed after the last state without it is computed again");
-    let empty = (Ledger::new(image, tiles).snapshot(None), FilmPart::new(size));
-    let (mut snapshot, film) = settled.unwrap_or(empty);
+    let (mut snapshot, film) = settled;
     snapshot.film = store_film(nodes, &film, &format!("film/back-{}", ledger.commits()))?;
     let kept = snapshot.commits;
     let record = ledger.record_of(snapshot);
     let name = write(nodes, &record)?;
     ledger.go_back(&record, name)?;
-    let settled = Some((ledger.snapshot(None), film.clone()));
+    let settled = (ledger.snapshot(None), film.clone());
     Ok(Resumed { ledger, film, settled, reused: kept, lost: reused.saturating_sub(kept) })
 }
 
@@ -186,14 +186,14 @@ pub struct Collected {
 ///
 /// # Errors
 /// When somebody writes to the store, or no chain can be followed (then nothing is deleted).
-pub async fn collect(store: &dyn BlockStore) -> Result<Collected, JobError> {
-    if super::owner::is_owned(store).await? {
+pub async fn collect(store: Arc<dyn BlockStore>) -> Result<Collected, JobError> {
+    if super::owner::is_owned(store.as_ref()).await? {
         return Err(JobError::Owned(format!("{}: a job is writing to it: wait for its end", store.describe())));
     }
     // nobody may begin to write between reading the records and deleting
-    let owner = Ownership::take(store, false).await?;
-    let collected = collect_owned(store).await;
-    owner.give_back(store).await?;
+    let owner = Ownership::take(store.clone(), false).await?;
+    let collected = collect_owned(store.as_ref()).await;
+    owner.give_back().await?;
     collected
 }
 

@@ -1,23 +1,24 @@
 //! An executor with virtual nodes, in one process.
 
 pub mod attempt;
-pub(crate) mod cameras;
 #[cfg(test)]
 mod closed_forms;
 mod disks;
-mod driver;
 pub mod faults;
+mod film;
 pub mod journal;
 pub mod nodes;
 pub mod owner;
+mod run;
 pub mod slots;
 #[cfg(test)]
 mod tests;
+mod threads;
 pub mod usage;
 
-pub use driver::render_local;
 use rayherd_render::film::FilmPart;
 use rayherd_render::frame::Frame;
+pub use run::render_local;
 
 use crate::job::{Image, JobError, JobSettings, PreparedScene, Sampling};
 use crate::report::Report;

@@ -1,19 +1,23 @@
 //! One writer at a time: an object with a heartbeat says who writes to a store.
 
 use std::fs::read_to_string;
-use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use bytes::Bytes;
 use serde::{Deserialize, Serialize};
+use tokio::sync::Notify;
+use tokio::task::JoinHandle;
 
+use crate::driver::Pointer;
 use crate::job::JobError;
 use crate::store::{BlockStore, StoreError};
 
 const KEY: &str = "owner";
 /// A heartbeat older than this is nobody's.
 const STALE: u64 = 60;
-/// Time between heartbeats.
-const BEAT: Duration = Duration::from_secs(10);
+/// Time between heartbeats; tests do not wait so long.
+const BEAT: Duration = if cfg!(test) { Duration::from_millis(20) } else { Duration::from_secs(10) };
 
 /// Who writes.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -31,10 +35,19 @@ pub struct Owner {
     pub beat: u64,
 }
 
-/// The right to write, kept up by heartbeats.
+/// The right to write, kept up by heartbeats, whatever else goes on, until it is given back or dropped.
 pub struct Ownership {
+    writer: Arc<Writer>,
+    beating: Mutex<Option<JoinHandle<()>>>,
+}
+
+/// What beats.
+struct Writer {
     own: Owner,
-    last: Instant,
+    store: Arc<dyn BlockStore>,
+    /// Who took the store over, once somebody did.
+    taken: Mutex<Option<String>>,
+    over: Notify,
 }
 
 impl Owner {
@@ -70,10 +83,14 @@ impl Owner {
 }
 
 impl Ownership {
-    /// Takes the store, unless somebody alive has it and `takeover` is false.
-    pub async fn take(store: &dyn BlockStore, takeover: bool) -> Result<Ownership, JobError> {
+    /// Takes the store, unless somebody alive has it and `takeover` is false. The heart beats on the runtime that this is
+    /// called on.
+    ///
+    /// # Errors
+    /// [`JobError::Owned`] when somebody else has it, or takes it at the same moment.
+    pub async fn take(store: Arc<dyn BlockStore>, takeover: bool) -> Result<Ownership, JobError> {
         let own = Owner::this_process();
-        match read(store).await? {
+        match read(store.as_ref()).await? {
             Some(other) if other.is_alive(&own) && !takeover => {
                 return Err(JobError::Owned(format!(
                     "{}: process {} writes to it (last sign {} s ago): wait for it, stop it, or force with --takeover",
@@ -88,40 +105,75 @@ impl Ownership {
             Some(other) => tracing::info!("process {}, which wrote to {}, is gone", other.pid, store.describe()),
             None => {}
         }
-        let ownership = Ownership { own, last: Instant::now() };
-        ownership.write(store).await?;
+        let writer = Arc::new(Writer { own, store, taken: Mutex::default(), over: Notify::new() });
+        writer.write().await?;
         // of two that begin together the later one stays
-        ownership.check(store).await?;
-        Ok(ownership)
+        writer.check().await?;
+        let beating = tokio::spawn(writer.clone().beat());
+        Ok(Ownership { writer, beating: Mutex::new(Some(beating)) })
     }
 
     /// Session's name, for names of objects.
     pub fn session(&self) -> &str {
-        &self.own.session
-    }
-
-    /// Writes a heartbeat when one is due.
-    ///
-    /// # Errors
-    /// When somebody else took the store over.
-    pub async fn beat(&mut self, store: &dyn BlockStore) -> Result<(), JobError> {
-        if self.last.elapsed() < BEAT {
-            return Ok(());
-        }
-        self.check(store).await?;
-        self.last = Instant::now();
-        self.own.beat = now();
-        self.write(store).await
+        &self.writer.own.session
     }
 
     /// Gives the store back.
-    pub async fn give_back(&self, store: &dyn BlockStore) -> Result<(), JobError> {
-        self.check(store).await?;
-        Ok(store.delete(&[KEY.to_owned()]).await?)
+    ///
+    /// # Errors
+    /// When somebody else has taken it over, or it cannot be written to.
+    pub async fn give_back(&self) -> Result<(), JobError> {
+        self.writer.over.notify_one();
+        let beating = self.beating.lock().unwrap_or_else(PoisonError::into_inner).take();
+        if let Some(beating) = beating
+            && let Err(e) = beating.await
+        {
+            tracing::warn!("{}: the heartbeat ended: {e}", self.writer.store.describe());
+        }
+        self.writer.check().await?;
+        Ok(self.writer.store.delete(&[KEY.to_owned()]).await?)
+    }
+}
+
+impl Drop for Ownership {
+    fn drop(&mut self) {
+        self.writer.over.notify_one();
+    }
+}
+
+/// What was committed is found by its records; all that is to be said is whether it may be.
+impl Pointer for Ownership {
+    fn move_to(&self, _: u64, _: &str) -> Result<(), JobError> {
+        match &*self.writer.taken.lock().unwrap_or_else(PoisonError::into_inner) {
+            Some(who) => Err(JobError::Owned(who.clone())),
+            None => Ok(()),
+        }
+    }
+}
+
+impl Writer {
+    /// Beats until the end, or until somebody else has the store.
+    async fn beat(self: Arc<Self>) {
+        while tokio::time::timeout(BEAT, self.over.notified()).await.is_err() {
+            let beat = async {
+                self.check().await?;
+                self.write().await
+            };
+            match beat.await {
+                Ok(()) => {}
+                Err(JobError::Owned(who)) => {
+                    *self.taken.lock().unwrap_or_else(PoisonError::into_inner) = Some(who);
+                    return;
+                }
+                // whatever the job writes next fails as well, or it has passed by then
+                Err(e) => tracing::warn!("no heartbeat: {e}"),
+            }
+        }
     }
 
-    async fn check(&self, store: &dyn BlockStore) -> Result<(), JobError> {
-        match read(store).await? {
+    async fn check(&self) -> Result<(), JobError> {
+        let store = &self.store;
+        match read(store.as_ref()).await? {
             Some(other) if other.session != self.own.session => {
                 Err(JobError::Owned(format!("{} was taken over by process {}", store.describe(), other.pid)))
             }
@@ -132,9 +184,11 @@ impl Ownership {
             ))),
         }
     }
-    async fn write(&self, store: &dyn BlockStore) -> Result<(), JobError> {
-        let body = serde_json::to_vec(&self.own).map_err(|e| JobError::Internal(e.to_string()))?;
-        Ok(store.put(KEY, Bytes::from(body)).await?)
+
+    async fn write(&self) -> Result<(), JobError> {
+        let own = Owner { beat: now(), ..self.own.clone() };
+        let body = serde_json::to_vec(&own).map_err(|e| JobError::Internal(e.to_string()))?;
+        Ok(self.store.put(KEY, Bytes::from(body)).await?)
     }
 }
 
@@ -173,22 +227,28 @@ mod tests {
     use super::*;
     use crate::store::MemoryStore;
 
+    async fn put(store: &dyn BlockStore, owner: &Owner) {
+        store.put(KEY, serde_json::to_vec(owner).unwrap().into()).await.unwrap();
+    }
+
     #[tokio::test]
     async fn a_live_writer_is_refused_and_a_dead_one_is_no_obstacle() {
-        let store = MemoryStore::default();
-        let first = Ownership::take(&store, false).await.unwrap();
-        let refused = Ownership::take(&store, false).await.err().unwrap().to_string();
+        let store: Arc<dyn BlockStore> = Arc::new(MemoryStore::default());
+        let first = Ownership::take(store.clone(), false).await.unwrap();
+        let refused = Ownership::take(store.clone(), false).await.err().unwrap().to_string();
         assert!(refused.contains("--takeover"), "{refused}");
-        let mut second = Ownership::take(&store, true).await.unwrap();
-        assert!(matches!(first.give_back(&store).await, Err(JobError::Owned(_))));
+        let second = Ownership::take(store.clone(), true).await.unwrap();
+        assert!(matches!(first.give_back().await, Err(JobError::Owned(_))));
+        second.give_back().await.unwrap();
         // killed: the number is in use, but by another process
-        second.own.started += 1;
-        second.write(&store).await.unwrap();
-        assert!(!is_owned(&store).await.unwrap());
-        let third = Ownership::take(&store, false).await.unwrap();
-        assert!(is_owned(&store).await.unwrap());
-        third.give_back(&store).await.unwrap();
-        assert!(!is_owned(&store).await.unwrap());
+        let mut dead = Owner::this_process();
+        dead.started += 1;
+        put(store.as_ref(), &dead).await;
+        assert!(!is_owned(store.as_ref()).await.unwrap());
+        let third = Ownership::take(store.clone(), false).await.unwrap();
+        assert!(is_owned(store.as_ref()).await.unwrap());
+        third.give_back().await.unwrap();
+        assert!(!is_owned(store.as_ref()).await.unwrap());
         // on another machine, or in another container of this one, only the heartbeat tells
         let container = Owner::this_process().boot.replace("pid:[", "pid:[1");
         for (age, owned) in [(STALE - 5, true), (STALE + 1, false)] {
@@ -197,8 +257,21 @@ mod tests {
             (other.boot, other.beat) = (if owned { container.clone() } else { "elsewhere".into() }, now() - age);
             // a number that nobody has here says nothing
             other.pid = u32::MAX;
-            store.put(KEY, serde_json::to_vec(&other).unwrap().into()).await.unwrap();
-            assert_eq!(Ownership::take(&store, false).await.is_err(), owned);
+            put(store.as_ref(), &other).await;
+            assert_eq!(Ownership::take(store.clone(), false).await.is_err(), owned);
         }
+    }
+
+    #[tokio::test]
+    async fn who_was_taken_over_learns_of_it_before_the_next_commit_counts() {
+        let store: Arc<dyn BlockStore> = Arc::new(MemoryStore::default());
+        let first = Ownership::take(store.clone(), false).await.unwrap();
+        assert!(first.move_to(0, "a").is_ok());
+        let second = Ownership::take(store.clone(), true).await.unwrap();
+        while first.move_to(1, "b").is_ok() {
+            tokio::time::sleep(BEAT).await;
+        }
+        assert!(second.move_to(1, "b").is_ok());
+        second.give_back().await.unwrap();
     }
 }

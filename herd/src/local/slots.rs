@@ -43,18 +43,17 @@ impl Drop for Permit<'_> {
 }
 
 /// Tells an attempt to stop.
-#[derive(Clone)]
+#[derive(Clone, Default)]
 pub struct StopFlag {
     stop: Arc<AtomicBool>,
-    changed: Arc<(Mutex<()>, Condvar)>,
     /// Checks that are left before it stops of itself; none for no such end.
     left: Option<Arc<AtomicU32>>,
 }
 
 impl StopFlag {
-    /// Stops when it is set, or after so many batches.
-    pub fn new(batches: Option<u32>) -> Self {
-        StopFlag { stop: Arc::default(), changed: Arc::default(), left: batches.map(|n| Arc::new(AtomicU32::new(n))) }
+    /// The same flag, for an attempt that is to stop after so many batches even if it is not set.
+    pub fn limited(&self, batches: u32) -> Self {
+        StopFlag { left: Some(Arc::new(AtomicU32::new(batches))), ..self.clone() }
     }
     /// Whether it was set.
     pub fn is_set(&self) -> bool {
@@ -62,16 +61,7 @@ impl StopFlag {
     }
     /// The attempt ends at its next batch.
     pub fn set(&self) {
-        let _held = self.changed.0.lock().unwrap_or_else(PoisonError::into_inner);
         self.stop.store(true, Ordering::Relaxed);
-        self.changed.1.notify_all();
-    }
-    /// Waits until it is set.
-    pub fn wait(&self) {
-        let mut held = self.changed.0.lock().unwrap_or_else(PoisonError::into_inner);
-        while !self.stop.load(Ordering::Relaxed) {
-            held = self.changed.1.wait(held).unwrap_or_else(PoisonError::into_inner);
-        }
     }
 }
 
@@ -81,6 +71,6 @@ impl Stop for StopFlag {
             .left
             .as_ref()
             .is_some_and(|left| left.fetch_update(Ordering::Relaxed, Ordering::Relaxed, |n| n.checked_sub(1)).is_err());
-        if used_up || self.stop.load(Ordering::Relaxed) { Err(JobError::Stopped) } else { Ok(()) }
+        if used_up || self.is_set() { Err(JobError::Stopped) } else { Ok(()) }
     }
 }

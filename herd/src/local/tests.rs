@@ -263,7 +263,7 @@ fn what_was_committed_before_a_crash_is_taken_over() {
             if crashes == 2 {
                 // in the middle of everything, a collection takes nothing that is needed
                 runtime.block_on(store.delete(&["owner".to_owned()])).unwrap();
-                let collected = runtime.block_on(collect(store.as_ref())).unwrap();
+                let collected = runtime.block_on(collect(store.clone())).unwrap();
                 assert!(collected.kept > 0);
             }
         }
@@ -309,7 +309,7 @@ fn a_straggler_is_beaten_by_a_second_attempt_and_leaves_nothing() {
             memory_per_node: Some(2 * largest(&SCENES[1])),
             straggler_seconds: Some(0.0),
             threads: NonZeroU32::new(2),
-            faults: Some(faults::Faults::only(0, faults::Fate::Straggle)),
+            faults: Some(faults::Faults::first(faults::Fate::Straggle)),
             ..small(strategy, &[1, 1])
         };
         let made =

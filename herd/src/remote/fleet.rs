@@ -10,8 +10,8 @@ use std::time::{Duration, Instant};
 use rayherd_render::film::FilmPart;
 use tokio::sync::Notify;
 
-use super::executor::{Executor, Finished, Launch};
 use super::message::{Answer, Beat, Done, Failure, Poll, Report, Stage, Work, WorkerId};
+use crate::driver::{Event, Executor, Finished, Launch};
 use crate::job::JobError;
 use crate::ledger::TaskId;
 use crate::local::attempt::Made;
@@ -404,13 +404,13 @@ impl Executor for Fleet {
         drop(state);
         self.tell();
     }
-    fn next(&self, wait: Duration) -> Result<Option<Finished>, JobError> {
+    fn next(&self, wait: Duration) -> Result<Option<Event>, JobError> {
         let mut state = self.lock();
         state.check()?;
         state.sweep();
         if state.finished.is_empty() {
             state = self.wait(state, wait);
         }
-        Ok(state.finished.pop_front())
+        Ok(state.finished.pop_front().map(Event::Finished))
     }
 }

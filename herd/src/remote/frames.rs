@@ -8,11 +8,10 @@ use rayherd_scene::manifest::Manifest;
 use rayherd_scene::objects::{ObjectRef, ObjectStore};
 use tokio::runtime::Handle;
 
-use super::driver::{Driver, Start, image_name};
-use super::executor::Pointer;
 use super::message::{Done, Stage, Work};
 use super::parts::Parts;
 use super::{Depot, Fleet};
+use crate::driver::{Driver, Pointer, Start};
 use crate::job::{JobError, JobSettings, NodeSpec, PreparedScene, Progress, Sampling, spec as from_spec};
 use crate::ledger::{FilmRef, Ledger, Snapshot, newest};
 use crate::local::attempt::Shared;
@@ -136,7 +135,7 @@ fn render(
         store_film: true,
         buckets: stage.buckets,
     };
-    let image = image_name(scene, &stage.frame)?;
+    let image = scene.image_name(&stage.frame)?;
     let resumed = resume(&shared.nodes, &image, tiles(&stage.frame), keeper.newest(number))?;
     let pointer = FramePointer { keeper: keeper.clone(), frame: number };
     let start = Start {
@@ -144,7 +143,7 @@ fn render(
         ledger: resumed.ledger,
         film: Parts::new(job.fleet, resumed.film, resumed.settled.1),
         settled: resumed.settled.0,
-        pointer: Arc::new(pointer),
+        pointer: Some(Arc::new(pointer)),
         session: job.session.clone(),
         redone: 0,
     };

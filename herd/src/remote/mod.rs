@@ -2,11 +2,9 @@
 //!
 //! The operator plans and commits; it never reads rays or film. A worker asks for work ([`Poll`]), does it next to its own
 //! store ([`station`]) and reports ids and counts ([`Report`]). [`fleet::Fleet`] is the operator's side: the executor of the
-//! loop over rounds, fed by workers that come and go. How messages travel is not known here.
+//! loop over rounds ([`crate::driver`]), fed by workers that come and go. How messages travel is not known here.
 
 pub mod depot;
-pub mod driver;
-pub mod executor;
 pub mod fleet;
 pub mod frames;
 pub mod message;

@@ -1,8 +1,8 @@
 //! A film that lies in parts on the workers' stores, and is added up by them.
 
-use super::executor::FilmSum;
 use super::fleet::Fleet;
 use super::message::{Done, Work};
+use crate::driver::FilmSum;
 use crate::job::JobError;
 use crate::ledger::FilmRef;
 use crate::local::attempt::Made;

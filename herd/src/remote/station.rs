@@ -223,7 +223,7 @@ impl<'l> Station<'l> {
     }
 
     fn work(&self, id: String, work: &Work, stage: Option<&Stage>, shared: Option<&Shared>) {
-        let stop = StopFlag::new(None);
+        let stop = StopFlag::default();
         self.lock().insert(id.clone(), stop.clone());
         if self.is_leaving() {
             stop.set();

@@ -2,7 +2,7 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use super::Driver;
+use super::{Driver, Executor, FilmSum};
 use crate::job::NodeSpec;
 use crate::ledger::{Destination, GroupRef};
 use crate::plan::{self, Assignment, NodeView, SplitView, View, Waiting};
@@ -10,11 +10,14 @@ use crate::plan::{self, Assignment, NodeView, SplitView, View, Waiting};
 /// Largest forest that a task may hold (see `rayherd_render::bvh::Forest`), less room for its top tree.
 const FOREST_BYTES: u64 = (8 << 30) - (64 << 20);
 
-impl Driver<'_, '_> {
+impl<F: FilmSum> Driver<'_, '_, F> {
     /// What to start now, with the keys of the groups that each takes.
-    pub(super) fn plan(&mut self) -> Vec<(Assignment, Vec<String>)> {
+    pub(super) fn plan(&mut self, executor: &dyn Executor) -> Vec<(Assignment, Vec<String>)> {
+        if (0..self.free.len() as u32).all(|n| !executor.is_up(n)) {
+            return Vec::new();
+        }
         let settings = self.shared.settings;
-        let holders = self.shared.nodes.holders();
+        let holders = executor.holders().unwrap_or_else(|| self.shared.nodes.holders());
         let split =
             |&s: &u32| SplitView { bytes: self.shared.scene.split_bytes(s), holders: holders[s as usize].clone() };
         let splits: Vec<SplitView> = self.order.iter().map(split).collect();
@@ -31,7 +34,7 @@ impl Driver<'_, '_> {
         let mut view = View {
             strategy: settings.strategy,
             splits: &splits,
-            nodes: &self.nodes_as_seen(),
+            nodes: &self.nodes_as_seen(executor),
             waiting,
             reduce,
             camera: self.cameras.rays(),
@@ -65,7 +68,7 @@ impl Driver<'_, '_> {
     }
 
     /// The nodes as the planner sees them.
-    pub(super) fn nodes_as_seen(&self) -> Vec<NodeView> {
+    fn nodes_as_seen(&self, executor: &dyn Executor) -> Vec<NodeView> {
         let settings = self.shared.settings;
         let node = |(n, spec): (usize, &NodeSpec)| {
             let memory = self.shared.nodes.memory(n as u32);
@@ -74,7 +77,8 @@ impl Driver<'_, '_> {
             } else {
                 memory.warm().into_iter().map(|s| self.rank[s as usize]).collect()
             };
-            NodeView { slots: spec.slots, free: self.free[n], memory: memory.capacity(), warm }
+            let up = |slots| if executor.is_up(n as u32) { slots } else { 0 };
+            NodeView { slots: up(spec.slots), free: up(self.free[n]), memory: memory.capacity(), warm }
         };
         settings.nodes.iter().enumerate().map(node).collect()
     }

@@ -1,12 +1,11 @@
 //! What is done when nodes, copies or rays are lost.
 
-use super::{Driver, Objects};
+use super::{Driver, FilmSum, Objects};
 use crate::job::JobError;
 use crate::ledger::Outputs;
-use crate::local::journal;
 use crate::report::Kind;
 
-impl Driver<'_, '_> {
+impl<F: FilmSum> Driver<'_, '_, F> {
     /// Rays were lost with all their copies: back to the last state without rays on their way.
     ///
     /// Which task made a ray is not kept, so its place in the tree of tasks is not known; the film, which only adds, cannot be
@@ -16,16 +15,16 @@ impl Driver<'_, '_> {
     pub(super) fn go_back(&mut self, why: &JobError) -> Result<(), JobError> {
         tracing::warn!("{why}; what was committed since no ray was on its way is computed again");
         let before: Objects = self.ledger.snapshot(None).waiting.into_iter().map(|g| (g.key, g.holders)).collect();
-        let (mut snapshot, film) = self.settled.clone();
+        let mut snapshot = self.settled.clone();
+        self.film.go_back();
         self.redone += self.ledger.commits() - snapshot.commits;
-        if self.owner.is_some() {
-            let key = format!("film/{}-b{:08}-{}", self.session, self.ledger.commits(), self.redone);
-            snapshot.film = journal::store_film(&self.shared.nodes, &film, &key)?;
+        if self.is_durable() {
+            let key = self.film_name();
+            snapshot.film = self.film.store(&key)?;
         }
         let record = self.ledger.record_of(snapshot);
         let name = self.write(&record)?;
         self.ledger.go_back(&record, name)?;
-        self.film = film;
         self.stop_all();
         self.running.clear();
         self.cameras.clear();
@@ -36,7 +35,6 @@ impl Driver<'_, '_> {
     /// A node is gone with its disk and what ran on it, and comes back empty. What has other copies is copied again.
     pub(super) fn lose_node(&mut self, node: u32) -> Result<(), JobError> {
         let nodes = &self.shared.nodes;
-        nodes.lose(node)?;
         self.windows[node as usize].clear();
         self.live.values().filter(|l| l.node == node).for_each(|l| l.stop.set());
         for group in self.ledger.snapshot(None).waiting {
@@ -45,7 +43,7 @@ impl Driver<'_, '_> {
                 self.ledger.relocate(&group.key, holders);
             }
         }
-        if self.owner.is_some() {
+        if self.is_durable() {
             // film parts may have lain there; the sums are here
             self.write_snapshot()?;
         }
@@ -57,16 +55,5 @@ impl Driver<'_, '_> {
         let groups = outputs.groups.iter().map(|g| (g.key.clone(), g.holders.clone()));
         let film = outputs.film.iter().map(|f| (f.key.clone(), f.holders.clone()));
         self.shared.nodes.delete(&groups.chain(film).collect::<Objects>())
-    }
-
-    /// A byte of one copy of something that an attempt made changes.
-    pub(super) fn corrupt(&mut self, ordinal: u64, outputs: &Outputs) -> Result<(), JobError> {
-        let Some(faults) = self.faults else { return Ok(()) };
-        if outputs.groups.is_empty() {
-            return Ok(());
-        }
-        let group = &outputs.groups[faults.pick(ordinal, outputs.groups.len() as u64) as usize];
-        let holder = group.holders[faults.pick(ordinal + 1, group.holders.len() as u64) as usize];
-        self.shared.nodes.corrupt(holder, &group.key, faults.pick(ordinal + 2, group.bytes))
     }
 }

@@ -1,11 +1,11 @@
 //! What is told while the job runs and at its end.
 
-use super::{Driver, image};
+use super::{Driver, FilmSum};
 use crate::job::{JobError, Status};
-use crate::local::{JobOutcome, usage};
+use crate::local::usage;
 use crate::report::Report;
 
-impl Driver<'_, '_> {
+impl<F: FilmSum> Driver<'_, '_, F> {
     pub(super) fn tell(&self) {
         let [w, h] = self.shared.frame.size;
         let pixels = u64::from(w) * u64::from(h);
@@ -22,19 +22,22 @@ impl Driver<'_, '_> {
         });
     }
 
-    pub(super) fn finish(mut self) -> Result<JobOutcome, JobError> {
+    /// What was made, after [`Driver::run`]: the film, its samples per pixel, the report.
+    ///
+    /// # Errors
+    /// When the film's error cannot be had.
+    pub fn finish(mut self) -> Result<(F, u32, Report), JobError> {
         // the picture is whole, and all that it is made of is committed: neither may cost it
-        if self.owner.is_some()
+        if self.is_durable()
             && let Err(e) = self.write_snapshot()
         {
             tracing::warn!("the store stays as the last commit left it: {e}");
         }
-        super::give_back(&self.shared.nodes, self.owner.as_ref());
         let spp = self.ledger.done().complete();
         let [width, height] = self.shared.frame.size;
         let settings = self.shared.settings;
         let counts = &self.shared.scene.manifest.counts;
-        let rel_mse = self.film.rel_mse(spp);
+        let rel_mse = self.film.rel_mse(spp)?;
         let (bytes, nodes_detail) = self.shared.nodes.report();
         let skipped = [
             ("degenerate", counts.degenerate),
@@ -59,7 +62,7 @@ impl Driver<'_, '_> {
             hops: self.hops,
             bytes_per_hop: (self.hops > 0).then(|| self.hop_bytes as f64 / self.hops as f64),
             peak_memory_bytes: usage::peak_memory(),
-            non_finite: self.film.rejected().count,
+            non_finite: self.ledger.non_finite(),
             rel_mse,
             target_reached: self.sampling.target_error.map(|t| rel_mse.is_some_and(|e| e <= t)),
             nodes_detail,
@@ -67,10 +70,6 @@ impl Driver<'_, '_> {
             ..Report::default()
         };
         report.set_bytes(&bytes);
-        for (pixel, sample) in &self.film.rejected().keys {
-            let (x, y) = (pixel % width, pixel / width);
-            tracing::warn!("pixel {x},{y} sample {sample}: a contribution is not finite or too large");
-        }
-        Ok(JobOutcome { image: image(&self.film, spp), film: self.film, spp, report })
+        Ok((self.film, spp, report))
     }
 }

@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use crate::job::JobError;
+use crate::job::{Image, JobError};
 use crate::ledger::{FilmRef, TaskId};
 use crate::local::attempt::{Attempt, Made};
 use crate::local::slots::StopFlag;
@@ -34,6 +34,14 @@ pub struct Finished {
     pub bytes: Bytes,
 }
 
+/// What an executor tells of.
+pub enum Event {
+    /// An attempt came to its end.
+    Finished(Finished),
+    /// A node has lost its memory and its disk, and is there again, empty.
+    NodeLost(u32),
+}
+
 /// Where tasks run.
 pub trait Executor {
     /// Whether the node takes tasks now.
@@ -44,13 +52,13 @@ pub trait Executor {
     }
     /// Whether one more attempt would compute at once.
     fn has_room(&self) -> bool;
-    /// Starts an attempt. It is told of by [`Executor::next`], once.
+    /// Starts an attempt. It is told of by [`Executor::next`], at least once.
     fn launch(&self, launch: Launch);
-    /// The next attempt that ended; none after `wait`.
+    /// What happens next; none after `wait`.
     ///
     /// # Errors
     /// When nothing can run any more.
-    fn next(&self, wait: Duration) -> Result<Option<Finished>, JobError>;
+    fn next(&self, wait: Duration) -> Result<Option<Event>, JobError>;
 }
 
 /// The sum of all committed film parts, and a state of it to go back to.
@@ -76,6 +84,14 @@ pub trait FilmSum {
     fn rel_mse(&mut self, spp: u32) -> Result<Option<f64>, JobError>;
     /// Whether a stored object is still needed.
     fn needs(&self, name: &str) -> bool;
+    /// The error of the sum as it is, about, for whoever watches: only where it costs little.
+    fn shown_error(&self, _spp: u32) -> Option<f64> {
+        None
+    }
+    /// The picture of the sum as it is, likewise.
+    fn preview(&self, _spp: u32) -> Option<Image> {
+        None
+    }
 }
 
 /// Where it is kept which record is the newest: the one place that must be consistent.

@@ -1,12 +1,13 @@
 //! Which samples are queued when, and when the job is over.
 
-use super::Driver;
+use super::{Driver, FilmSum};
+use crate::job::JobError;
 use crate::wave;
 
 /// Camera units that are queued at once, about; steps are added as they are used up.
 const QUEUED_UNITS: usize = 100_000;
 
-impl Driver<'_, '_> {
+impl<F: FilmSum> Driver<'_, '_, F> {
     /// Queues camera units of the next steps, as far as they need not wait for what comes before.
     pub(super) fn queue_steps(&mut self) {
         let spp = self.sampling.spp;
@@ -31,7 +32,7 @@ impl Driver<'_, '_> {
     }
 
     /// Where the step that begins at `self.queued` ends: where the schedule says, or before, if time would run out.
-    pub(super) fn step_end(&self) -> u32 {
+    fn step_end(&self) -> u32 {
         // what an earlier run began of a step is finished first
         let reach = self.ledger.taken().reach();
         let end = wave::step_end(self.queued).min(self.sampling.spp).max(reach);
@@ -54,13 +55,13 @@ impl Driver<'_, '_> {
     }
 
     /// After everything queued came to its end: whether the job is over.
-    pub(super) fn step_done(&mut self) -> bool {
-        self.error = self.film.rel_mse(self.queued);
+    pub(super) fn step_done(&mut self) -> Result<bool, JobError> {
+        self.error = self.film.rel_mse(self.queued)?;
         let reached = match (self.sampling.target_error, self.error) {
             (Some(target), Some(error)) => error <= target,
             _ => false,
         };
         let late = self.sampling.time_limit.is_some_and(|limit| self.start.elapsed().as_secs_f64() >= limit);
-        self.queued >= self.sampling.spp || reached || late
+        Ok(self.queued >= self.sampling.spp || reached || late)
     }
 }

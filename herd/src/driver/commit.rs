@@ -1,13 +1,11 @@
 //! From what an attempt reports to what counts.
 
-use std::sync::mpsc::Receiver;
 use std::time::{Duration, Instant};
 
-use super::{Driver, Message, Objects, image};
+use super::{Driver, FilmSum, Finished, Objects};
 use crate::job::JobError;
 use crate::ledger::{Record, Refused, TaskId};
 use crate::local::attempt::Made;
-use crate::local::faults::Fate;
 use crate::local::journal;
 
 /// The error that is shown is not found more often.
@@ -18,15 +16,20 @@ const ERROR_SHARE: u32 = 50;
 /// Commits between two snapshots.
 const SNAPSHOT_EVERY: u64 = 16;
 
-impl Driver<'_, '_> {
-    pub(super) fn handle(&mut self, message: Message) -> Result<(), JobError> {
-        let Message { task, number, result, cpu } = message;
+impl<F: FilmSum> Driver<'_, '_, F> {
+    pub(super) fn handle(&mut self, finished: Finished) -> Result<(), JobError> {
+        let Finished { task, number, result, cpu, bytes } = finished;
         let Some(live) = self.live.remove(&(task, number)) else {
+            // a report that arrives twice: all was done about it the first time
+            if self.reported.contains(&(task, number)) {
+                return Ok(());
+            }
             return Err(JobError::Internal("an attempt reports that was never started".into()));
         };
+        self.reported.insert((task, number));
         self.free[live.node as usize] += 1;
         self.shared.nodes.busy(live.node, cpu);
-        let fate = self.faults.map_or(Fate::Fine, |f| f.fate(live.ordinal));
+        self.shared.nodes.count_all(live.node, &bytes);
         let made = match result {
             Ok(made) => made,
             Err(JobError::Stopped) => return self.lost(task, number),
@@ -40,32 +43,11 @@ impl Driver<'_, '_> {
             }
             Err(e) => return Err(e),
         };
-        match fate {
-            Fate::LoseResult => {
-                self.discard(&made.outputs)?;
-                return self.lost(task, number);
-            }
-            Fate::LoseNode => {
-                self.lost(task, number)?;
-                return self.lose_node(live.node);
-            }
-            Fate::Corrupt => self.corrupt(live.ordinal, &made.outputs)?,
-            _ => {}
-        }
-        let twice = (fate == Fate::Duplicate).then(|| Made {
-            film: made.film.clone(),
-            outputs: made.outputs.clone(),
-            hops: made.hops,
-        });
-        self.commit(task, number, made, cpu)?;
-        match twice {
-            Some(made) => self.commit(task, number, made, cpu),
-            None => Ok(()),
-        }
+        self.commit(task, number, made, cpu)
     }
 
     /// An attempt that does not count. If it was the task's last one, its inputs wait again.
-    pub(super) fn lost(&mut self, task: TaskId, number: u32) -> Result<(), JobError> {
+    fn lost(&mut self, task: TaskId, number: u32) -> Result<(), JobError> {
         if self.ledger.lost(task, number)
             && let Some(running) = self.running.remove(&task)
         {
@@ -74,22 +56,22 @@ impl Driver<'_, '_> {
         Ok(())
     }
 
-    pub(super) fn commit(&mut self, task: TaskId, number: u32, made: Made, cpu: f64) -> Result<(), JobError> {
+    fn commit(&mut self, task: TaskId, number: u32, made: Made, cpu: f64) -> Result<(), JobError> {
         let settled = self.ledger.is_settled();
         let record = match self.ledger.record(task, made.outputs.clone()) {
             Ok(record) => record,
-            // beaten by another attempt, or arrived twice
-            Err(Refused::NotRunning(_)) if self.committed.contains(&(task, number)) => return Ok(()),
+            // beaten by another attempt
             Err(Refused::NotRunning(_)) => return self.discard(&made.outputs),
             Err(e) => return Err(e.into()),
         };
         if settled && !record.made.groups.is_empty() {
-            self.settled = (self.ledger.snapshot(None), self.film.clone());
+            self.settled = self.ledger.snapshot(None);
+            self.film.settle();
         }
         let name = self.write(&record)?;
         self.ledger.commit(task, &record, name)?;
         self.committed.insert((task, number));
-        self.film.merge(&made.film)?;
+        self.film.add(&made)?;
         let made_rays = record.made.rays;
         self.rate.add(cpu, made_rays.closest + made_rays.shadow, made_rays.camera);
         self.tasks += 1;
@@ -99,7 +81,7 @@ impl Driver<'_, '_> {
         self.hops += made.hops;
         self.hop_bytes += bytes;
         if let Some(film) = record.made.film {
-            if self.owner.is_some() {
+            if self.is_durable() {
                 self.superfluous[1].push((film.key, film.holders));
             } else {
                 self.shared.nodes.delete(&[(film.key, film.holders)])?;
@@ -110,27 +92,31 @@ impl Driver<'_, '_> {
             let consumed: Objects = running.spec.groups.into_iter().map(|g| (g.key, g.holders)).collect();
             self.shared.nodes.delete(&consumed)?;
         }
-        if self.owner.is_some() && self.tasks.is_multiple_of(SNAPSHOT_EVERY) {
+        if self.is_durable() && self.tasks.is_multiple_of(SNAPSHOT_EVERY) {
             self.write_snapshot()?;
         }
-        if self.progress.wants_preview() {
-            let spp = self.ledger.taken().reach().max(1);
-            self.progress.preview(&image(&self.film, spp));
+        if self.progress.wants_preview()
+            && let Some(image) = self.film.preview(self.ledger.taken().reach().max(1))
+        {
+            self.progress.preview(&image);
         }
         // for the display: about, since some pixels may wait for samples that others have. What decides is in `step_done`
         if Instant::now() >= self.next_error {
             let begun = Instant::now();
-            self.error = self.film.rel_mse(self.ledger.taken().reach()).or(self.error);
+            self.error = self.film.shown_error(self.ledger.taken().reach()).or(self.error);
             self.next_error = Instant::now() + ERROR_EVERY.max(ERROR_SHARE * begun.elapsed());
         }
         Ok(())
     }
 
-    /// After the last thread has ended: deletes what attempts made that reported too late to count.
-    pub(super) fn discard_late(&self, receive: &Receiver<Message>) -> Result<(), JobError> {
-        for message in receive.try_iter() {
-            if let Ok(made) = message.result
-                && !self.committed.contains(&(message.task, message.number))
+    /// After the last attempt has ended: deletes what those made that reported too late to count.
+    ///
+    /// # Errors
+    /// When the store fails.
+    pub fn discard_late(&self, late: impl Iterator<Item = Finished>) -> Result<(), JobError> {
+        for finished in late {
+            if let Ok(made) = finished.result
+                && !self.committed.contains(&(finished.task, finished.number))
             {
                 self.discard(&made.outputs)?;
             }
@@ -140,28 +126,35 @@ impl Driver<'_, '_> {
 
     /// Makes a record durable, if the job keeps records; its name.
     pub(super) fn write(&mut self, record: &Record) -> Result<String, JobError> {
-        if self.owner.is_none() {
-            return Ok(record.sequence.to_string());
-        }
+        let Some(pointer) = &self.pointer else { return Ok(record.sequence.to_string()) };
         let name = journal::write(&self.shared.nodes, record)?;
+        pointer.move_to(record.sequence, &name)?;
         self.old_records[1].push(journal::key(record.sequence, &name));
         Ok(name)
     }
 
     /// Writes the whole state, and deletes what the snapshot before this one made superfluous.
     pub(super) fn write_snapshot(&mut self) -> Result<(), JobError> {
-        let nodes = &self.shared.nodes;
-        let key = format!("film/{}-s{:08}", self.session, self.ledger.commits());
-        let film = journal::store_film(nodes, &self.film, &key)?;
+        let key = self.film_name();
+        let film = self.film.store(&key)?;
         let record = self.ledger.record_of(self.ledger.snapshot(film.clone()));
-        let [old, new] = std::mem::take(&mut self.superfluous);
+        let [old, mut new] = std::mem::take(&mut self.superfluous);
         let [old_records, new_records] = std::mem::take(&mut self.old_records);
         let name = self.write(&record)?;
         self.ledger.follow_snapshot(&record, name)?;
+        let (needed, old): (Objects, Objects) = old.into_iter().partition(|(name, _)| self.film.needs(name));
+        new.extend(needed);
+        let nodes = &self.shared.nodes;
         nodes.delete(&old)?;
         nodes.wait(nodes.store().delete(&old_records))?;
         self.superfluous = [new, film.into_iter().map(|f| (f.key, f.holders)).collect()];
         self.old_records[0] = new_records;
         Ok(())
+    }
+
+    /// A name that no film of this run has.
+    pub(super) fn film_name(&mut self) -> String {
+        self.stored += 1;
+        format!("film/{}-s{:08}", self.session, self.stored)
     }
 }

@@ -1,0 +1,62 @@
+//! A film summed in memory.
+
+use rayherd_render::film::FilmPart;
+
+use super::attempt::Made;
+use super::journal;
+use super::nodes::Nodes;
+use crate::driver::FilmSum;
+use crate::job::{Image, JobError};
+use crate::ledger::FilmRef;
+
+/// The sum of all committed parts, and the one to go back to.
+pub struct MemoryFilm<'n, 'a> {
+    nodes: &'n Nodes<'a>,
+    now: FilmPart,
+    settled: FilmPart,
+}
+
+impl<'n, 'a> MemoryFilm<'n, 'a> {
+    /// Begins with a sum; `settled` is what to go back to.
+    pub fn new(nodes: &'n Nodes<'a>, now: FilmPart, settled: FilmPart) -> Self {
+        MemoryFilm { nodes, now, settled }
+    }
+    /// The sum.
+    pub fn into_sum(self) -> FilmPart {
+        self.now
+    }
+}
+
+impl FilmSum for MemoryFilm<'_, '_> {
+    fn add(&mut self, made: &Made) -> Result<(), JobError> {
+        Ok(self.now.merge(&made.film)?)
+    }
+    fn settle(&mut self) {
+        self.settled.clone_from(&self.now);
+    }
+    fn go_back(&mut self) {
+        self.now.clone_from(&self.settled);
+    }
+    fn store(&mut self, name: &str) -> Result<Option<FilmRef>, JobError> {
+        journal::store_film(self.nodes, &self.now, name)
+    }
+    fn rel_mse(&mut self, spp: u32) -> Result<Option<f64>, JobError> {
+        Ok(self.now.rel_mse(spp))
+    }
+    fn needs(&self, _: &str) -> bool {
+        // all of it is here
+        false
+    }
+    fn shown_error(&self, spp: u32) -> Option<f64> {
+        self.now.rel_mse(spp)
+    }
+    fn preview(&self, spp: u32) -> Option<Image> {
+        Some(image(&self.now, spp))
+    }
+}
+
+/// The picture of a film.
+pub fn image(film: &FilmPart, spp: u32) -> Image {
+    let [width, height] = film.size();
+    Image { width, height, pixels: film.resolve(spp) }
+}

@@ -1,0 +1,149 @@
+//! A whole job in this process: takes the store, goes on where it ends, runs the loop over rounds on threads.
+
+use std::sync::Arc;
+use std::sync::mpsc::channel;
+
+use rayherd_render::film::FilmPart;
+use rayherd_render::frame::Frame;
+
+use super::attempt::Shared;
+use super::faults::Schedule;
+use super::film::{MemoryFilm, image};
+use super::nodes::Nodes;
+use super::owner::Ownership;
+use super::slots::Gate;
+use super::threads::Threads;
+use super::{JobOutcome, check, journal};
+use crate::driver::{Driver, Pointer, Start};
+use crate::job::{JobError, JobSettings, PreparedScene, Progress, Sampling};
+use crate::ledger::Ledger;
+use crate::store::Spilling;
+use crate::task::camera::tiles;
+
+/// Ray groups and film parts of a job without a store that stay in memory; what is more goes to a temporary folder.
+const AT_REST_IN_MEMORY: u64 = 128 << 20;
+
+/// Renders a frame of a prepared scene on virtual nodes in this process.
+///
+/// The image is a function of (scene, frame, samples) alone, to the byte: not of the settings, not of time.
+///
+/// # Errors
+/// When settings, scene or store do not allow it; see [`JobError`].
+pub fn render_local(
+    scene: &PreparedScene,
+    frame: &Frame,
+    sampling: &Sampling,
+    settings: &JobSettings,
+    progress: &dyn Progress,
+) -> Result<JobOutcome, JobError> {
+    check(scene, frame, sampling, settings)?;
+    let store = match &settings.commits {
+        Some(commits) => commits.store.clone(),
+        None => Arc::new(Spilling::new(AT_REST_IN_MEMORY)) as _,
+    };
+    let shared = Shared {
+        scene,
+        frame,
+        settings,
+        nodes: Nodes::new(scene, settings, store)?,
+        store_film: settings.commits.is_some() || settings.nodes.len() > 1,
+        buckets: settings.slots(),
+    };
+    let Some(commits) = &settings.commits else {
+        let ledger = Ledger::new(&scene.image_name(frame)?, tiles(frame));
+        let start = Start {
+            settled: ledger.snapshot(None),
+            ledger,
+            film: MemoryFilm::new(&shared.nodes, FilmPart::new(frame.size), FilmPart::new(frame.size)),
+            pointer: None,
+            session: "job".to_owned(),
+            reused: 0,
+            redone: 0,
+        };
+        return rounds(&shared, start, sampling, progress);
+    };
+    let nodes = &shared.nodes;
+    let owner = Ownership::take(nodes.store().clone(), commits.takeover);
+    let owner = Arc::new(nodes.wait(owner)?);
+    let result = resume(&shared, &owner, commits.resume, sampling.spp)
+        .and_then(|start| rounds(&shared, start, sampling, progress));
+    // the result is what counts: if this fails, the next run finds a dead owner
+    if let Err(e) = nodes.wait(owner.give_back()) {
+        tracing::warn!("{e}");
+    }
+    result
+}
+
+/// Reads the state to go on from.
+fn resume<'n, 'a>(
+    shared: &'n Shared<'a>,
+    owner: &Arc<Ownership>,
+    may_resume: bool,
+    spp: u32,
+) -> Result<Start<MemoryFilm<'n, 'a>>, JobError> {
+    let (nodes, size) = (&shared.nodes, shared.frame.size);
+    let place = nodes.store().describe();
+    let refuse = |message: String| Err(JobError::Settings(message));
+    if !may_resume && !nodes.wait(nodes.store().list("records/"))?.is_empty() {
+        return refuse(format!("{place} holds a job already: resume it, or use another store"));
+    }
+    let image = shared.scene.image_name(shared.frame)?;
+    let resumed = journal::resume(nodes, &image, tiles(shared.frame), size)?;
+    let reach = resumed.ledger.done().reach();
+    if reach > spp {
+        return refuse(format!(
+            "{place} holds {reach} samples per pixel, {spp} were asked for: ask for at least as many"
+        ));
+    }
+    let (settled, settled_film) = resumed.settled;
+    Ok(Start {
+        ledger: resumed.ledger,
+        film: MemoryFilm::new(nodes, resumed.film, settled_film),
+        settled,
+        pointer: Some(owner.clone() as Arc<dyn Pointer>),
+        session: owner.session().to_owned(),
+        reused: resumed.reused,
+        redone: resumed.lost,
+    })
+}
+
+/// Runs the loop over rounds on threads.
+fn rounds(
+    shared: &Shared,
+    start: Start<MemoryFilm>,
+    sampling: &Sampling,
+    progress: &dyn Progress,
+) -> Result<JobOutcome, JobError> {
+    let settings = shared.settings;
+    let threads = settings
+        .threads
+        .map_or_else(|| std::thread::available_parallelism().map_or(1, |n| n.get()), |n| n.get() as usize);
+    let gate = Gate::new(threads);
+    let (send, receive) = channel();
+    let mut driver = Driver::new(shared, start, sampling, progress);
+    let mut late = Vec::new();
+    let result = std::thread::scope(|scope| {
+        let threads = Threads::new(scope, shared, &gate, (send, &receive));
+        let result = match &settings.faults {
+            None => driver.run(&threads),
+            Some(faults) => {
+                let serial = settings.threads.is_some_and(|n| n.get() == 1);
+                let schedule = Schedule::new(faults.clone(), &threads, &shared.nodes, serial);
+                let result = driver.run(&schedule);
+                late = schedule.left();
+                result
+            }
+        };
+        driver.stop_all();
+        result
+    });
+    driver.discard_late(late.into_iter().chain(receive.try_iter()))?;
+    result?;
+    let (film, spp, report) = driver.finish()?;
+    let film = film.into_sum();
+    for (pixel, sample) in &film.rejected().keys {
+        let (x, y) = (pixel % film.size()[0], pixel / film.size()[0]);
+        tracing::warn!("pixel {x},{y} sample {sample}: a contribution is not finite or too large");
+    }
+    Ok(JobOutcome { image: image(&film, spp), film, spp, report })
+}
