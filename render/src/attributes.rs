@@ -119,6 +119,8 @@ impl AttributeBlock {
 
 #[cfg(test)]
 mod tests {
+    use rayherd_tests::mutation;
+
     use super::*;
     use crate::testing::Rng;
 
@@ -150,18 +152,22 @@ mod tests {
             assert!(AttributeBlock::decode(&good[..n], 20).is_err());
         }
         assert!(AttributeBlock::decode(&good, 21).is_err());
-        let mut rng = Rng(2);
         let mut refused = 0;
-        for _ in 0..20_000 {
-            let mut bad = good.clone();
-            let i = rng.u32() as usize % 48;
-            bad[i] = rng.u32() as u8;
+        let rounds = mutation::rounds("attributes", 20_000, |random| {
+            // mostly in the header and the runs
+            let bad = match random.below(2) {
+                0 => mutation::bytes(&good, random),
+                _ => [mutation::bytes(&good[..48], random), good[48..].to_vec()].concat(),
+            };
             match AttributeBlock::decode(&bad, 20) {
-                Ok(block) => assert_eq!(block.shapes.len(), 20),
+                Ok(block) => {
+                    assert_eq!(block.shapes.len(), 20);
+                    assert!([0, 20].contains(&block.normals.len()) && [0, 20].contains(&block.uvs.len()));
+                }
                 Err(_) => refused += 1,
             }
-        }
-        assert!(refused > 5000, "{refused}");
+        });
+        assert!(rounds.is_none_or(|n| refused > n / 4 && refused < n), "{refused} of {rounds:?}");
         // a header that asks for the most: refused before memory is taken
         let mut huge = good[..16].to_vec();
         huge[4..16].fill(0xff);

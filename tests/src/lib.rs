@@ -1,1 +1,3 @@
-//! Tests across crates live in `tests/`.
+//! What tests of several crates share. Tests across crates live in `tests/`.
+
+pub mod mutation;

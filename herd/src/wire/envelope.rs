@@ -159,6 +159,7 @@ fn checksum(bytes: &[u8]) -> [u8; HEADER - CHECKED] {
 #[cfg(test)]
 mod tests {
     use proptest::prelude::*;
+    use rayherd_tests::mutation;
 
     use super::*;
 
@@ -206,6 +207,32 @@ mod tests {
                 prop_assert_eq!(payload.len() as u64, length);
             }
         }
+    }
+
+    /// With the checksum as it was and with a right one: what is opened is what was announced, within the limit.
+    #[test]
+    fn mutants_are_opened_or_refused() {
+        let packed = seal(Kind::RoundRecord, &[b"a record ".as_slice(); 40].concat(), Compress::Lz4).to_vec();
+        let plain = seal(Kind::RoundRecord, &[1, 2, 3, 4, 5], Compress::No).to_vec();
+        let mut opened = 0;
+        let rounds = mutation::rounds("envelope", 20_000, |random| {
+            let valid = if random.below(2) == 0 { &packed } else { &plain };
+            let mut bytes = mutation::bytes(valid, random);
+            if bytes != *valid {
+                assert!(open(Kind::RoundRecord, &bytes, 1000).is_err());
+            }
+            if bytes.len() >= HEADER {
+                bytes = resealed(bytes, |_| {});
+            }
+            if let Ok(payload) = open(Kind::RoundRecord, &bytes, 1000) {
+                assert!(
+                    payload.len() <= 1000
+                        && payload.len() as u64 == u64::from_le_bytes(bytes[8..16].try_into().unwrap())
+                );
+                opened += 1;
+            }
+        });
+        assert!(rounds.is_none_or(|n| opened > n / 100 && opened < n), "{opened} of {rounds:?}");
     }
 
     #[test]

@@ -1,3 +1,5 @@
+use rayherd_tests::mutation;
+
 use super::*;
 use crate::description::Affine;
 use crate::grid::CellData;
@@ -128,35 +130,15 @@ fn broken_manifests_are_refused_with_a_reason() {
 #[test]
 fn mutated_bytes_are_refused_or_canonical_and_never_panic() {
     let bytes = sample().encode();
-    let mut state = 1u64;
-    let mut next = || {
-        state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
-        (state >> 33) as usize
-    };
-    let words: [&[u8]; 8] = [b"null", b"-1", b"1e400", b"[]", b"18446744073709551615", b"\"x\"", b"{}", b"4294967295"];
-    for _ in 0..20_000 {
-        let mut mutated = bytes.clone();
-        for _ in 0..=next() % 3 {
-            let at = next() % mutated.len();
-            match next() % 5 {
-                0 => mutated[at] ^= 1 << (next() % 8),
-                1 => mutated.truncate(at.max(1)),
-                2 => drop(mutated.drain(at..(at + 1 + next() % 40).min(mutated.len()))),
-                3 => {
-                    let word = words[next() % words.len()];
-                    // where a value stands
-                    let at = mutated[at..].iter().position(|&b| b == b':' || b == b',').map_or(at, |p| at + p + 1);
-                    mutated.splice(at..at, word.iter().copied());
-                }
-                _ => mutated[at] = b'0' + (next() % 10) as u8,
-            }
-            if mutated.is_empty() {
-                mutated.push(b'{');
-            }
-        }
+    let words = ["1e400", "1e39", "\"x\"", "{}", "[]", "\"Auto\"", "\"format\":0,"];
+    let mut read = 0;
+    let rounds = mutation::rounds("manifest", 20_000, |random| {
+        let mutated = mutation::text(&bytes, &words, random);
         if let Ok(manifest) = Manifest::decode(&mutated) {
             assert_eq!(manifest.encode(), mutated);
             manifest.grid().unwrap();
+            read += 1;
         }
-    }
+    });
+    assert!(rounds.is_none_or(|n| read > n / 100 && read < n), "{read} of {rounds:?}");
 }

@@ -1,5 +1,3 @@
-use std::time::{Duration, Instant};
-
 use proptest::prelude::*;
 use proptest::strategy::ValueTree;
 use rayherd_render::camera::Camera;
@@ -9,6 +7,7 @@ use rayherd_render::material::{Bsdf, Material};
 use rayherd_render::path::{Context, Outcome, Surface, Surfaces, shade};
 use rayherd_render::ray::{Hit, PrimId, Ray};
 use rayherd_render::world::{EmissivePrimitive, Primitive, ShapeInfo, World};
+use rayherd_tests::mutation;
 
 use super::*;
 
@@ -134,50 +133,31 @@ fn check_mutant(frame: &Frame, payload: &[u8]) -> bool {
     }
 }
 
-/// Seeded mutations of good payloads, past the checksum; `RAYHERD_FUZZ_SECONDS` makes it longer.
+/// Mutations of good payloads, past the checksum.
 #[test]
 fn mutants_are_read_or_refused() {
-    let seconds = std::env::var("RAYHERD_FUZZ_SECONDS").ok().map(|s| s.parse().expect("RAYHERD_FUZZ_SECONDS"));
-    let (end, least) = (Instant::now() + Duration::from_secs(seconds.unwrap_or(0)), 20_000);
     let frame = frame();
     let mut runner = proptest::test_runner::TestRunner::deterministic();
     let seeds: Vec<Vec<u8>> = (0..8)
         .map(|_| encode_payload(&frame, &flights().new_tree(&mut runner).unwrap().current()))
         .chain([encode_payload(&frame, &Flights::default())])
         .collect();
-    let mut state = 0x9e37_79b9_7f4a_7c15u64;
-    let mut random = move |n: usize| {
-        state ^= state << 13;
-        state ^= state >> 7;
-        state ^= state << 17;
-        (state >> 11) as usize % n.max(1)
-    };
-    let (mut tried, mut read) = (0u64, 0u64);
-    while tried < least || Instant::now() < end {
-        let mut payload = seeds[random(seeds.len())].clone();
-        for _ in 0..1 + random(3) {
-            let at = random(payload.len());
-            match random(7) {
-                0 => payload[at] ^= 1 << random(8),
-                1 => payload[at] = random(256) as u8,
-                2 => payload.truncate(at),
-                3 => payload.insert(at, random(256) as u8),
-                4 => drop(payload.remove(at)),
-                // the counts
-                5 => payload[random(16).min(at)] = random(256) as u8,
-                _ => {
-                    let n = random(40).min(payload.len() - at);
-                    payload.extend_from_within(at..at + n);
-                }
-            }
-            if payload.is_empty() {
-                break;
-            }
+    let mut read = 0;
+    let rounds = mutation::rounds("ray group", 20_000, |random| {
+        let mut payload = seeds[random.below(seeds.len())].clone();
+        if random.below(4) == 0 {
+            // the counts
+            let at = random.below(payload.len().min(16));
+            payload[at] = random.bits() as u8;
+        } else {
+            payload = mutation::bytes(&payload, random);
         }
         read += u64::from(check_mutant(&frame, &payload));
-        tried += 1;
-    }
-    assert!(read > tried / 100 && read < tried, "{read} of {tried} mutants were read: they test nothing");
+    });
+    assert!(
+        rounds.is_none_or(|n| read > n / 100 && read < n),
+        "{read} of {rounds:?} mutants were read: they test nothing"
+    );
 }
 
 #[test]

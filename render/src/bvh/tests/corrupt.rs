@@ -1,5 +1,7 @@
 //! Geometry objects that are wrong: named errors, no panic, and whatever passes can be traced.
 
+use rayherd_tests::mutation;
+
 use super::super::block::HEADER;
 use super::super::layout::*;
 use super::super::testing::*;
@@ -84,34 +86,30 @@ fn each_kind_of_damage_is_named() {
     says(with(&|o| write_u32(o, index, free)), "stands in two leaves");
 }
 
-/// 3000 damaged objects; RAYHERD_MUTATIONS=N for more.
 #[test]
 fn no_damage_makes_it_panic_or_read_elsewhere() {
-    let rounds: usize = match std::env::var("RAYHERD_MUTATIONS") {
-        Ok(n) => n.parse().expect("RAYHERD_MUTATIONS is a number of objects"),
-        Err(_) => 3000,
-    };
     let mut random = Random::new(21);
     let (triangles, good) = sample(&mut random);
     let rays: Vec<Ray> = rays_for(&mut random, &triangles, 60, 1.0);
     let mut tracers = kernels();
     let mut passed = 0;
-    for round in 0..rounds {
+    let rounds = mutation::rounds("geometry", 3000, |seed| {
+        let mut random = Random::new(seed.bits());
         let mut object = good.clone();
         for _ in 0..=random.below(3) {
             damage(&mut random, &mut object);
         }
         let mut forest = Forest::new(1 << 22).unwrap();
         // beside a good block, so that a reference that leads astray meets other records
-        if round % 2 == 0 {
+        if random.below(2) == 0 {
             forest.insert(&good).unwrap();
         }
-        let Ok(handle) = forest.insert(&object) else { continue };
-        passed += usize::from(object != good);
+        let Ok(handle) = forest.insert(&object) else { return };
+        passed += u64::from(object != good);
         forest.finish().unwrap();
         let expected: Vec<_> = closest(&mut tracers[0], &forest, &rays);
         for tracer in &mut tracers[1..] {
-            assert_eq!(closest(tracer, &forest, &rays), expected, "round {round}");
+            assert_eq!(closest(tracer, &forest, &rays), expected);
             any(tracer, &forest, &rays);
         }
         for hit in expected.iter().filter(|h| h.is_hit()) {
@@ -119,8 +117,8 @@ fn no_damage_makes_it_panic_or_read_elsewhere() {
             forest.prim_id(hit.prim);
         }
         assert!(forest.remove(handle));
-    }
-    println!("{passed} of {rounds} damaged objects passed the check");
+    });
+    println!("{passed} of {rounds:?} damaged objects passed the check");
 }
 
 /// One change: of a bit, a word, a word for another, a cut, or more bytes.
