@@ -1,6 +1,8 @@
 //! Whose fault an error is, and how it is told.
 
+use std::cell::Cell;
 use std::io;
+use std::panic::{AssertUnwindSafe, catch_unwind};
 
 use rayherd_herd::job::JobError;
 use rayherd_herd::store::{StoreError, object_is_users};
@@ -76,10 +78,30 @@ pub fn tell(error: &anyhow::Error) -> String {
     told
 }
 
+thread_local! {
+    static OTHERS: Cell<bool> = const { Cell::new(false) };
+}
+
+/// Runs a library's code that panics on some bad input; the panic's message, untold, when it does. `run` must start no thread: a panic
+/// there is not caught.
+pub fn of_others<T>(run: impl FnOnce() -> T) -> Result<T, String> {
+    OTHERS.set(true);
+    // nothing that `run` changes is seen after a panic but by its owner's drop
+    let result = catch_unwind(AssertUnwindSafe(run));
+    OTHERS.set(false);
+    result.map_err(|what| {
+        let text = what.downcast_ref::<String>().map(String::as_str).or(what.downcast_ref::<&str>().copied());
+        text.unwrap_or("no message").to_owned()
+    })
+}
+
 /// Prints a panic as one short message that says how to report it. The process must then exit with 1.
 pub fn install_panic_hook() {
     let backtrace = std::panic::take_hook();
     std::panic::set_hook(Box::new(move |info| {
+        if OTHERS.get() {
+            return;
+        }
         if std::env::var_os("RUST_BACKTRACE").is_some() {
             backtrace(info);
         }
@@ -97,6 +119,13 @@ mod tests {
     use anyhow::Context;
 
     use super::*;
+
+    #[test]
+    fn a_panic_of_others_is_an_error() {
+        assert_eq!(of_others(|| 1), Ok(1));
+        assert_eq!(of_others(|| -> i32 { panic!("no {}", 2) }), Err("no 2".to_owned()));
+        assert!(!OTHERS.get());
+    }
 
     #[test]
     fn causes_are_told_once_and_faults_are_told_apart() {

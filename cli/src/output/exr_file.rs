@@ -7,7 +7,7 @@ use std::path::Path;
 
 use exr::prelude::{FlatImage, FlatSamples, MetaData, ReadChannels, ReadLayers};
 
-use crate::fault::Mistake;
+use crate::fault::{self, Mistake};
 
 /// The channels of an EXR file by name (`LAYER.NAME` when there are layers), as f32, rows from the top.
 pub struct Channels {
@@ -27,32 +27,38 @@ const MOST_EXPANSION: u64 = 1100;
 pub fn read(path: &Path) -> anyhow::Result<Channels> {
     let mistake = |why: String| Mistake(format!("{}: {why}", path.display()));
     let bytes = fs::read(path).map_err(|e| Mistake(format!("cannot read {}: {e}", path.display())))?;
-    let meta = MetaData::read_from_buffered(Cursor::new(&bytes), false)
-        .map_err(|e| mistake(format!("is no EXR file: {e}")))?;
+    // the decoder panics on some damaged files (compression B44, in 1.74)
+    let image =
+        fault::of_others(|| decode(&bytes)).unwrap_or_else(|what| Err(format!("cannot be read as EXR: {what}")));
+    image.and_then(collect).map_err(|e| mistake(e).into())
+}
+
+fn decode(bytes: &[u8]) -> Result<FlatImage, String> {
+    let meta = MetaData::read_from_buffered(Cursor::new(bytes), false).map_err(|e| format!("is no EXR file: {e}"))?;
     let mut claimed = 0u128;
     for header in &meta.headers {
         // what the reader takes memory for: every channel over the whole window
         let pixels = header.layer_size.width() as u128 * header.layer_size.height() as u128;
         for channel in &header.channels.list {
             if channel.sampling != exr::math::Vec2(1, 1) {
-                return Err(mistake(format!("has a subsampled channel {}", channel.name)).into());
+                return Err(format!("has a subsampled channel {}", channel.name));
             }
             claimed += pixels * channel.sample_type.bytes_per_sample() as u128;
         }
     }
     if claimed > bytes.len() as u128 * u128::from(MOST_EXPANSION) {
-        let message = format!("is damaged: its header claims {claimed} bytes of pixels in a file of {}", bytes.len());
-        return Err(mistake(message).into());
+        return Err(format!("is damaged: its header claims {claimed} bytes of pixels in a file of {}", bytes.len()));
     }
-    let image: FlatImage = exr::prelude::read()
+    exr::prelude::read()
         .no_deep_data()
         .largest_resolution_level()
         .all_channels()
         .all_layers()
         .all_attributes()
-        .from_buffered(Cursor::new(&bytes))
-        .map_err(|e| mistake(format!("cannot be read as EXR: {e}")))?;
-    collect(image).map_err(|e| mistake(e).into())
+        // a panic on one of its threads would end the process
+        .non_parallel()
+        .from_buffered(Cursor::new(bytes))
+        .map_err(|e| format!("cannot be read as EXR: {e}"))
 }
 
 fn collect(image: FlatImage) -> Result<Channels, String> {
@@ -88,6 +94,7 @@ mod tests {
     use exr::prelude::Text;
     use rayherd_herd::job::Image as Picture;
     use rayherd_herd::picture::{ATTRIBUTE, encode};
+    use rayherd_tests::mutation;
     use serde_json::{Map, Value};
 
     use super::*;
@@ -141,5 +148,67 @@ mod tests {
         fs::write(&path, huge).unwrap();
         let error = read(&path).err().unwrap().to_string();
         assert!(error.contains("a.exr"), "{error}");
+    }
+
+    /// Ours, and others' kinds of compression, tiles and sample types.
+    fn kinds() -> Vec<Vec<u8>> {
+        use exr::prelude::{
+            AnyChannel, AnyChannels, Blocks, Compression, Encoding, Image, Layer, LayerAttributes, LineOrder, Vec2,
+            WritableImage, f16,
+        };
+        let mut made = vec![encode(&picture(), &definition()).unwrap()];
+        let encodings = [
+            (Compression::Uncompressed, Blocks::ScanLines),
+            (Compression::RLE, Blocks::Tiles(Vec2(16, 16))),
+            (Compression::ZIP1, Blocks::ScanLines),
+            (Compression::PIZ, Blocks::ScanLines),
+            (Compression::PXR24, Blocks::ScanLines),
+            (Compression::B44, Blocks::ScanLines),
+        ];
+        for (compression, blocks) in encodings {
+            let f = FlatSamples::F32((0..20 * 24).map(|i| i as f32).collect());
+            let h = FlatSamples::F16((0..20 * 24).map(|i| f16::from_f32(i as f32)).collect());
+            let u = FlatSamples::U32((0..20 * 24).collect());
+            let list = [AnyChannel::new("Y", f), AnyChannel::new("H", h), AnyChannel::new("id", u)];
+            let channels = AnyChannels::sort(list.into_iter().collect());
+            let encoding = Encoding { compression, blocks, line_order: LineOrder::Increasing };
+            let layer = Layer::new((20, 24), LayerAttributes::named("a"), encoding, channels);
+            let mut bytes = Cursor::new(Vec::new());
+            Image::from_layer(layer).write().to_buffered(&mut bytes).unwrap();
+            made.push(bytes.into_inner());
+        }
+        made
+    }
+
+    #[test]
+    fn mutants_are_read_or_refused() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("a.exr");
+        let valid = kinds();
+        for bytes in &valid {
+            fs::write(&path, bytes).unwrap();
+            read(&path).unwrap();
+        }
+        let before = mutation::peak_memory();
+        let mut good = 0;
+        let rounds = mutation::rounds("EXR", 1500, |random| {
+            let valid = &valid[random.below(valid.len())];
+            // half of the changes in the header, which is a small part of a file
+            let head = valid.len().min(if random.below(2) == 0 { 500 } else { usize::MAX });
+            let bad = [mutation::bytes(&valid[..head], random), valid[head..].to_vec()].concat();
+            fs::write(&path, bad).unwrap();
+            match read(&path) {
+                Ok(channels) => {
+                    good += 1;
+                    assert!(channels.values.values().all(|v| v.len() == channels.width * channels.height));
+                }
+                Err(e) => assert!(e.is::<Mistake>() && e.to_string().contains("a.exr"), "{e}"),
+            }
+        });
+        assert!(rounds.is_none_or(|n| good > n / 100 && good < n), "{good} of {rounds:?} were read");
+        if let (Some(before), Some(after)) = (before, mutation::peak_memory()) {
+            let more = after.saturating_sub(before);
+            assert!(more < 256 << 10, "reading small files took {} MiB more", more >> 10);
+        }
     }
 }
