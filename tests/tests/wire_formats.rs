@@ -172,7 +172,7 @@ fn round_records() {
                 store.put(&format!("{place}-{}", blake3::hash(&bad).to_hex()), bad).await.unwrap();
                 if random.below(2) == 0 {
                     // what may be collected is found, or the job is refused
-                    let _ = collect(store.as_ref()).await;
+                    let _ = collect(store.clone()).await;
                 }
             });
             match render(&whole, &frame, Some(commits(&store))) {

@@ -37,7 +37,7 @@ pub struct Finished {
 /// What an executor tells of.
 pub enum Event {
     /// An attempt came to its end.
-    Finished(Finished),
+    Finished(Box<Finished>),
     /// A node has lost its memory and its disk, and is there again, empty.
     NodeLost(u32),
 }

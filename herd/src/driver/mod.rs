@@ -190,7 +190,7 @@ impl<'s, 'a, F: FilmSum> Driver<'s, 'a, F> {
                 self.second_attempts(executor);
             }
             match executor.next(Duration::from_millis(100))? {
-                Some(Event::Finished(finished)) => self.handle(finished)?,
+                Some(Event::Finished(finished)) => self.handle(*finished)?,
                 Some(Event::NodeLost(node)) => self.lose_node(node)?,
                 None => {}
             }

@@ -58,7 +58,7 @@ impl Executor for Threads<'_, '_> {
     }
     fn next(&self, wait: Duration) -> Result<Option<Event>, JobError> {
         match self.receive.recv_timeout(wait) {
-            Ok(finished) => Ok(Some(Event::Finished(finished))),
+            Ok(finished) => Ok(Some(Event::Finished(finished.into()))),
             Err(RecvTimeoutError::Timeout) => Ok(None),
             Err(RecvTimeoutError::Disconnected) => Err(JobError::Internal("all threads are gone".into())),
         }

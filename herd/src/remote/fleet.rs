@@ -411,6 +411,6 @@ impl Executor for Fleet {
         if state.finished.is_empty() {
             state = self.wait(state, wait);
         }
-        Ok(state.finished.pop_front().map(Event::Finished))
+        Ok(state.finished.pop_front().map(|f| Event::Finished(f.into())))
     }
 }

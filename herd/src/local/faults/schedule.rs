@@ -50,13 +50,13 @@ impl<'e, 'a> Schedule<'e, 'a> {
     /// What attempts have reported and nobody was told.
     pub fn left(self) -> Vec<Finished> {
         let State { held, events, .. } = self.state.into_inner();
-        let finished = |e| if let Event::Finished(f) = e { Some(f) } else { None };
+        let finished = |e| if let Event::Finished(f) = e { Some(*f) } else { None };
         held.into_iter().chain(events.into_iter().filter_map(finished)).collect()
     }
 
     /// Starts what has waited long enough, and the first one when nothing else is under way.
     fn release(&self, state: &mut State) {
-        while !(self.serial && !state.doing.is_empty()) {
+        while !self.serial || state.doing.is_empty() {
             let due = state.waiting.iter().position(|w| w.0 == 0);
             let next = due.or((state.doing.is_empty() && !state.waiting.is_empty()).then_some(0));
             let Some((_, mut launch, fate, identity)) = next.and_then(|at| state.waiting.remove(at)) else { return };
@@ -82,7 +82,7 @@ impl<'e, 'a> Schedule<'e, 'a> {
         let made = match &finished.result {
             Ok(made) => made,
             Err(_) => {
-                state.events.push_back(Event::Finished(finished));
+                state.events.push_back(Event::Finished(finished.into()));
                 return Ok(());
             }
         };
@@ -102,15 +102,15 @@ impl<'e, 'a> Schedule<'e, 'a> {
             Fate::LoseNode => {
                 self.discard(&made.outputs)?;
                 self.nodes.lose(doing.node)?;
-                state.events.push_back(Event::Finished(lost(&finished)));
+                state.events.push_back(Event::Finished(lost(&finished).into()));
                 state.events.push_back(Event::NodeLost(doing.node));
                 return Ok(());
             }
             Fate::Corrupt => self.corrupt(doing.identity, &made.outputs)?,
-            Fate::Duplicate => state.events.push_back(Event::Finished(twin(&finished))),
+            Fate::Duplicate => state.events.push_back(Event::Finished(twin(&finished).into())),
             _ => {}
         }
-        state.events.push_back(Event::Finished(finished));
+        state.events.push_back(Event::Finished(finished.into()));
         Ok(())
     }
 
@@ -175,7 +175,7 @@ impl Executor for Schedule<'_, '_> {
             let event = self.inner.next(wait)?;
             state = self.state.borrow_mut();
             match event {
-                Some(Event::Finished(finished)) => self.meet(&mut state, finished)?,
+                Some(Event::Finished(finished)) => self.meet(&mut state, *finished)?,
                 Some(event) => state.events.push_back(event),
                 None => {}
             }
