@@ -27,7 +27,7 @@ impl<F: FilmSum> Driver<'_, '_, F> {
     /// # Errors
     /// When the film's error cannot be had.
     pub fn finish(mut self) -> Result<(F, u32, Report), JobError> {
-        // the picture is whole, and all that it is made of is committed: neither may cost it
+        // the picture is whole, and all that it is made of is committed: a store that fails now may not cost it
         if self.is_durable()
             && let Err(e) = self.write_snapshot()
         {

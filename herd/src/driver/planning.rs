@@ -31,6 +31,8 @@ impl<F: FilmSum> Driver<'_, '_, F> {
                 Destination::Reduce(_) => reduce.push(entry),
             }
         }
+        // the nodes as they are for a new cut: what they hold was for the old one
+        let bare: Vec<NodeView>;
         let mut view = View {
             strategy: settings.strategy,
             splits: &splits,
@@ -47,19 +49,21 @@ impl<F: FilmSum> Driver<'_, '_, F> {
             traffic: self.traffic,
         };
         // a new cut is worth a thought when nothing is under way that was made for the old one
-        let (mut cut, nodes) = (None, view.nodes.iter().map(|n| NodeView { warm: BTreeSet::new(), ..n.clone() }));
-        let nodes: Vec<NodeView> = nodes.collect();
+        let mut cut = None;
         if settings.strategy == plan::Strategy::Auto
             && (self.cut.is_none() || (self.live.is_empty() && groups.is_empty()))
         {
             cut = Some(plan::cut::choose(&view)).filter(|c| Some(c) != self.cut.as_ref());
         }
         if let Some(cut) = &cut {
-            (view.cut, view.nodes) = (cut, &nodes);
+            bare = view.nodes.iter().map(|n| NodeView { warm: BTreeSet::new(), ..n.clone() }).collect();
+            (view.cut, view.nodes) = (cut, &bare);
         }
-        let plan = plan::plan(&view);
-        let keys = |a: &Assignment| a.groups.iter().map(|&g| groups[g].key.clone()).collect();
-        let plan = plan.into_iter().map(|a| (keys(&a), a)).map(|(keys, a)| (a, keys)).collect();
+        let with_keys = |a: Assignment| {
+            let keys = a.groups.iter().map(|&g| groups[g].key.clone()).collect();
+            (a, keys)
+        };
+        let plan = plan::plan(&view).into_iter().map(with_keys).collect();
         if cut.is_some() {
             self.windows.iter_mut().for_each(BTreeSet::clear);
             self.cut = cut;

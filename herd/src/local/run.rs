@@ -137,8 +137,12 @@ fn rounds(
         driver.stop_all();
         result
     });
-    driver.discard_late(late.into_iter().chain(receive.try_iter()))?;
+    let discarded = driver.discard_late(late.into_iter().chain(receive.try_iter()));
     result?;
+    // garbage that stays costs room, not the picture
+    if let Err(e) = discarded {
+        tracing::warn!("what came too late to count was not deleted: {e}");
+    }
     let (film, spp, report) = driver.finish()?;
     let film = film.into_sum();
     for (pixel, sample) in &film.rejected().keys {
