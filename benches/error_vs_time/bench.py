@@ -1,0 +1,206 @@
+"""Error against time: the same scene at the same depth by several renderers, interleaved, whole processes.
+
+Error is relMSE = mean((I - R)^2 / (R^2 + 0.01)) with the reference's own noise subtracted; the reference is Mitsuba's, in two halves, so that its
+noise is known. Time is CPU seconds of a process from its start (all threads), its wall seconds beside it, and the CPU of rendering alone. Each
+renderer is used as it comes; Mitsuba's kernel cache is filled first.
+"""
+import argparse
+import csv
+import datetime
+import json
+import math
+import os
+import platform
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+
+import scenes
+
+SIZE = 256
+# where peers are compared at equal error
+TARGETS = {"cornell": 0.001}
+TARGET = 0.01
+# a reference's noise, as relMSE, over the smallest error that is measured with it
+QUIET = 0.1
+
+MITSUBA = """
+import resource, sys, numpy as np, mitsuba as mi
+variant, xml, spp, seed, out = sys.argv[1], sys.argv[2], int(sys.argv[3]), int(sys.argv[4]), sys.argv[5]
+mi.set_variant(variant)
+def cpu():
+    used = resource.getrusage(resource.RUSAGE_SELF)
+    return used.ru_utime + used.ru_stime
+scene = mi.load_file(xml, **dict(kv.split('=') for kv in sys.argv[6:]))
+start = cpu()
+image = np.array(mi.render(scene, spp=spp, seed=seed), dtype=np.float32)[:, :, :3]
+print(cpu() - start)
+np.save(out, image)
+"""
+
+
+class Renderer:
+    def __init__(self, name: str, variant: str | None):
+        self.name, self.variant = name, variant
+
+    def render(self, a, xml: Path, spp: int, seed: int) -> dict:
+        """CPU, wall and CPU without start and loading, and the image."""
+        out, report = a.work / f"bench-{self.name}.npy", a.work / "bench.json"
+        if self.variant is None:
+            exr = a.work / "bench.exr"
+            command = [a.rayherd, "render", str(xml), "--size", f"{SIZE}x{SIZE}", "--spp", str(spp), "--seed", str(seed),
+                       "--max-depth", str(a.max_depth), "-o", str(exr), "--report", str(report)]
+        else:
+            values = scenes.parameters(xml, SIZE, a.max_depth)
+            command = [sys.executable, "-c", MITSUBA, self.variant, str(xml), str(spp), str(seed), str(out)]
+            command += [f"{k}={v}" for k, v in values.items()]
+        cpu, wall, text = run(command)
+        if self.variant is None:
+            r = json.loads(report.read_text())
+            tracing = sum(node["busy"] for node in r["nodes_detail"])
+            return {"cpu": cpu, "wall": wall, "render": tracing, "image": read_exr(exr)}
+        return {"cpu": cpu, "wall": wall, "render": float(text.split()[-1]), "image": np.load(out).astype(np.float64)}
+
+
+RENDERERS = [Renderer("rayherd", None), Renderer("llvm", "llvm_ad_rgb"), Renderer("scalar", "scalar_rgb")]
+
+
+def run(command: list) -> tuple:
+    start = datetime.datetime.now()
+    child = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    text, error = child.stdout.read(), child.stderr.read()
+    _, status, usage = os.wait4(child.pid, 0)
+    wall = (datetime.datetime.now() - start).total_seconds()
+    child.returncode = os.waitstatus_to_exitcode(status)
+    if child.returncode:
+        raise SystemExit(f"{' '.join(map(str, command))}\n{error.decode()}")
+    return usage.ru_utime + usage.ru_stime, wall, text.decode()
+
+
+def read_exr(path: Path) -> np.ndarray:
+    import mitsuba as mi
+
+    mi.set_variant("scalar_rgb")
+    bitmap = mi.Bitmap(str(path)).convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, srgb_gamma=False)
+    return np.array(bitmap).astype(np.float64)
+
+
+def reference(a, name: str, xml: Path, smallest: float) -> dict:
+    """Mitsuba's image in two halves, whose noise is below a tenth of the smallest error; made once, kept in the cache."""
+    known = a.shared / f"peers/refs/ref_{name}.npz"
+    path = known if known.exists() and a.max_depth == 8 else a.work / f"ref_{name}_d{a.max_depth}.npz"
+    if path.exists():
+        r = dict(np.load(path))
+        if path == known or noise(r) < QUIET * smallest:
+            return r
+    llvm, sums, counts, spp = RENDERERS[1], [0.0, 0.0], [0, 0], 4096
+    for i in range(64):
+        sums[i % 2] = sums[i % 2] + llvm.render(a, xml, spp, 100_000 + i)["image"]
+        counts[i % 2] += 1
+        if i % 2:
+            halves = [s / n for s, n in zip(sums, counts)]
+            r = {"ref": (halves[0] + halves[1]) / 2, "A": halves[0], "B": halves[1]}
+            print(f"{name}: reference of {(i + 1) * spp} spp, noise {noise(r):.2e}", flush=True)
+            np.savez(path, **r)
+            if noise(r) < QUIET * smallest:
+                break
+    return r
+
+
+def noise(r: dict) -> float:
+    return float(np.mean((r["A"] - r["B"]) ** 2 / 4 / (r["ref"] ** 2 + 0.01)))
+
+
+def error(r: dict, image: np.ndarray) -> float:
+    weight = 1 / (r["ref"] ** 2 + 0.01)
+    return float(np.mean((image - r["ref"]) ** 2 * weight)) - noise(r)
+
+
+def at_error(points: list, target: float) -> float | None:
+    """Seconds to an error, between the two measured points around it on a log-log line; None when it is not between two."""
+    points = sorted((e, t) for t, e in points if e > 0)
+    for (e0, t0), (e1, t1) in zip(points, points[1:]):
+        if e0 <= target <= e1:
+            f = math.log(target / e0) / math.log(e1 / e0) if e1 > e0 else 0.0
+            return math.exp(math.log(t0) + f * (math.log(t1) - math.log(t0)))
+    return None
+
+
+def plot(rows: list, names: list, path: Path) -> None:
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, axes = plt.subplots(2, len(names), figsize=(5.5 * len(names), 9), squeeze=False)
+    for column, scene in enumerate(names):
+        for row, (key, label) in enumerate([("cpu_s", "CPU-seconds from process start"), ("wall_s", "wall seconds from process start")]):
+            ax = axes[row][column]
+            for renderer in dict.fromkeys(r["renderer"] for r in rows):
+                mine = [r for r in rows if r["scene"] == scene and r["renderer"] == renderer]
+                spps = sorted({r["spp"] for r in mine})
+                xs = [np.median([r[key] for r in mine if r["spp"] == s]) for s in spps]
+                ys = [np.mean([r["rel_mse"] for r in mine if r["spp"] == s]) for s in spps]
+                ax.loglog(xs, ys, "o-", label=renderer)
+            ax.set(title=scene, xlabel=label, ylabel="relMSE")
+            ax.grid(True, which="both", alpha=0.3)
+            ax.legend()
+    figure.tight_layout()
+    figure.savefig(path, dpi=80)
+
+
+def main() -> None:
+    p = argparse.ArgumentParser(description=__doc__)
+    p.add_argument("names", nargs="*", default=["cornell", "gyroid"])
+    p.add_argument("--rayherd", required=True)
+    p.add_argument("--shared", type=Path, required=True)
+    p.add_argument("--work", type=Path, required=True)
+    p.add_argument("--results", type=Path, required=True)
+    p.add_argument("--spp", default="16,64,256,1024", type=lambda s: [int(x) for x in s.split(",")])
+    p.add_argument("--repeats", type=int, default=3)
+    p.add_argument("--max-depth", type=int, default=8)
+    p.add_argument("--without", action="append", default=[], help="a renderer to leave out: llvm or scalar")
+    a = p.parse_args()
+    a.work, a.shared = a.work.resolve(), a.shared.resolve()
+    a.work.mkdir(parents=True, exist_ok=True)
+    a.results.mkdir(parents=True, exist_ok=True)
+    renderers = [r for r in RENDERERS if r.name not in a.without]
+    rows = []
+    for name in a.names:
+        xml = scenes.prepare(name, a.shared, a.work)
+        target = TARGETS.get(name, TARGET)
+        ref = reference(a, name, xml, target / 4)
+        for r in renderers:
+            r.render(a, xml, 1, 0)  # fills kernel and page caches
+        for repeat in range(a.repeats):
+            for spp in a.spp:
+                for r in renderers:
+                    got = r.render(a, xml, spp, 12_345 + 7919 * repeat + spp)
+                    row = {"scene": name, "renderer": r.name, "spp": spp, "repeat": repeat, "cpu_s": round(got["cpu"], 3), "wall_s": round(got["wall"], 3),
+                           "render_cpu_s": round(got["render"], 3), "rel_mse": error(ref, got["image"]), "mean": float(got["image"].mean())}
+                    rows.append(row)
+                    print("{scene} {renderer} {spp} spp: {cpu_s:.2f} CPU-s ({render_cpu_s:.2f} without load), relMSE {rel_mse:.3e}".format(**row), flush=True)
+        seconds = {}
+        for r in renderers:
+            mine = [x for x in rows if x["scene"] == name and x["renderer"] == r.name]
+            points = [(np.median([x["cpu_s"] for x in mine if x["spp"] == s]), np.mean([x["rel_mse"] for x in mine if x["spp"] == s])) for s in a.spp]
+            seconds[r.name] = at_error(points, target)
+            told = "not between two points" if seconds[r.name] is None else f"{seconds[r.name]:.2f} CPU-s"
+            print(f"{name} to relMSE {target}: {r.name} {told}")
+        peers = [t for n, t in seconds.items() if n != "rayherd" and t]
+        if seconds["rayherd"] and peers:
+            print(f"{name}: {seconds['rayherd'] / min(peers):.3f} of the best peer's")
+    machine = next((l.split(":")[1].strip() for l in open("/proc/cpuinfo") if l.startswith("model name")), platform.machine())
+    stem = a.results / f"{datetime.date.today()}-{machine.replace(' ', '-')}"
+    with open(f"{stem}.csv", "w", newline="") as f:
+        w = csv.DictWriter(f, rows[0])
+        w.writeheader()
+        w.writerows(rows)
+    plot(rows, a.names, Path(f"{stem}.png"))
+    print(f"written to {stem}.csv and .png")
+
+
+if __name__ == "__main__":
+    main()
