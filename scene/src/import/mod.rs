@@ -3,6 +3,7 @@
 mod bare;
 mod bounds;
 mod framing;
+pub mod image;
 pub mod isosurface;
 mod mesh;
 mod metals;
