@@ -14,12 +14,60 @@ pub struct World {
     pub shapes: Vec<ShapeInfo>,
     /// Every primitive that emits, by ascending id.
     pub emissive: Vec<EmissivePrimitive>,
-    /// Radiance of a constant sky, if any.
-    pub environment: Option<[f32; 3]>,
+    /// Light from points and single directions, which no ray comes upon.
+    pub beams: Vec<Beam>,
+    /// The sky, if any.
+    pub environment: Option<Environment>,
     /// Lower corner of the scene's box.
     pub lo: [f32; 3],
     /// Upper corner of the scene's box.
     pub hi: [f32; 3],
+}
+
+/// Light from infinitely far away.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub enum Environment {
+    /// This radiance from everywhere.
+    Constant([f32; 3]),
+    /// A picture, which is an object of its own: [`crate::light::SkyMap`].
+    Map {
+        /// What the picture's values are multiplied by.
+        scale: f32,
+        /// Rows of the rotation (perhaps mirrored) that turns a direction of the world into one of the picture.
+        to_map: [[f32; 3]; 3],
+    },
+}
+
+/// Light that arrives at a point from one direction only.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub enum Beam {
+    /// A point that shines alike all around.
+    Point {
+        /// Where it is.
+        position: [f32; 3],
+        /// Radiant intensity, W/sr.
+        intensity: [f32; 3],
+    },
+    /// A point that shines into a cone.
+    Spot {
+        /// Where it is.
+        position: [f32; 3],
+        /// Unit vector along the cone's middle.
+        axis: [f32; 3],
+        /// Radiant intensity in the inner cone, W/sr.
+        intensity: [f32; 3],
+        /// Half angle of the inner cone, radians.
+        beam: f32,
+        /// Half angle beyond which it is dark, radians; from the inner cone on the intensity falls linearly with the angle.
+        cutoff: f32,
+    },
+    /// Parallel light from infinitely far away.
+    Directional {
+        /// Unit vector along which it travels.
+        direction: [f32; 3],
+        /// On a surface that faces it, W/m2.
+        irradiance: [f32; 3],
+    },
 }
 
 /// What a hit needs to know about its shape.

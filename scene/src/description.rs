@@ -137,6 +137,56 @@ pub struct Camera {
     pub fov_x: f64,
 }
 
+/// Light that arrives at a point from one direction only. World space.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub enum Beam {
+    /// A point that shines alike all around.
+    Point {
+        /// Where it is.
+        position: [f64; 3],
+        /// W/sr, linear RGB.
+        intensity: [f32; 3],
+    },
+    /// A point that shines into a cone.
+    Spot {
+        /// Where it is.
+        position: [f64; 3],
+        /// Unit vector along the cone's middle.
+        axis: [f64; 3],
+        /// In the inner cone, W/sr, linear RGB.
+        intensity: [f32; 3],
+        /// Half angle of the inner cone, degrees, below `cutoff`.
+        beam: f64,
+        /// Half angle of the cone, degrees, at most 180; between the two the intensity falls linearly with the angle.
+        cutoff: f64,
+    },
+    /// Parallel light from infinitely far away.
+    Directional {
+        /// Unit vector along which it travels.
+        direction: [f64; 3],
+        /// On a surface that faces it, W/m2, linear RGB.
+        irradiance: [f32; 3],
+    },
+}
+
+/// Light from infinitely far away, all around.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub enum Environment {
+    /// This radiance from everywhere.
+    Constant([f32; 3]),
+    /// A picture by latitude and longitude: see [`rayherd_render::light::SkyMap`].
+    Map {
+        /// PNG, JPEG, OpenEXR or Radiance HDR.
+        path: PathBuf,
+        /// Where the source names it.
+        place: Place,
+        /// What its values are multiplied by, above 0.
+        scale: f32,
+        /// Turns directions of the picture to the world's: rotation, mirroring and even scaling only; the latter changes nothing.
+        to_world: Affine,
+    },
+}
+
 /// Everything that a source says.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Description {
@@ -144,8 +194,10 @@ pub struct Description {
     pub shapes: Vec<Shape>,
     /// What shapes refer to.
     pub materials: Vec<Material>,
-    /// Radiance of a constant sky, if any.
-    pub environment: Option<[f32; 3]>,
+    /// Point lights, spot lights, parallel light.
+    pub beams: Vec<Beam>,
+    /// The sky, if any.
+    pub environment: Option<Environment>,
     /// The camera, if the source has one.
     pub camera: Option<Camera>,
     /// Width and height in pixels, if given.

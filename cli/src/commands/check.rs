@@ -8,8 +8,8 @@ use std::process::ExitCode;
 use clap::Args;
 use rayherd_api::{RenderJob, RenderJobSpec};
 use rayherd_herd::job::spec::import_options;
-use rayherd_scene::description::{Bsdf, Description, Geometry, MeshFormat};
-use rayherd_scene::import::{ImportOptions, Survey, import};
+use rayherd_scene::description::{Beam, Bsdf, Description, Environment, Geometry, MeshFormat};
+use rayherd_scene::import::{ImportOptions, Survey, import, sky_map};
 
 use super::{print, size};
 use crate::options::{self, SceneOptions};
@@ -52,15 +52,19 @@ pub fn run(arguments: &Arguments) -> anyhow::Result<ExitCode> {
     Ok(ExitCode::from(2))
 }
 
-/// Shapes that cannot be read to their end.
+/// Shapes and pictures that cannot be read to their end.
 fn problems(description: &Description, survey: &Survey) -> Vec<String> {
     let shapes = description.shapes.iter().zip(&survey.shapes);
-    shapes
+    let mut out: Vec<String> = shapes
         .filter_map(|(shape, found)| {
             let error = anyhow::Error::msg(found.error.as_ref()?.to_string());
             Some(format!("{}: shape \"{}\": {}", shape.place, shape.name, crate::fault::tell(&error)))
         })
-        .collect()
+        .collect();
+    if let Err(error) = sky_map(description.environment.as_ref()) {
+        out.push(format!("the sky: {error}"));
+    }
+    out
 }
 
 fn tell(scene: &str, description: &Description, survey: &Survey) -> String {
@@ -95,11 +99,16 @@ fn tell(scene: &str, description: &Description, survey: &Survey) -> String {
 fn lights(description: &Description, survey: &Survey) -> String {
     let emits = description.shapes.iter().zip(&survey.shapes).filter(|(s, _)| s.emission.is_some());
     let primitives: u64 = emits.clone().map(|(_, found)| found.triangles + found.spheres).sum();
-    let sky = match description.environment {
-        Some(rgb) => format!(", sky of {rgb:?}"),
+    let sky = match &description.environment {
+        Some(Environment::Constant(rgb)) => format!(", sky of {rgb:?}"),
+        Some(Environment::Map { path, .. }) => format!(", sky from {}", path.display()),
         None => String::new(),
     };
-    format!("{} of {}{sky}", count(emits.count() as u64, "shape"), count(primitives, "primitive"))
+    let beams = match description.beams.len() {
+        0 => String::new(),
+        _ => format!(", {}", kinds(description.beams.iter().map(beam))),
+    };
+    format!("{} of {}{beams}{sky}", count(emits.count() as u64, "shape"), count(primitives, "primitive"))
 }
 
 /// "3: 2 obj, 1 sphere".
@@ -112,6 +121,14 @@ fn kinds<'a>(names: impl Iterator<Item = &'a str>) -> String {
 
 fn count(n: u64, what: &str) -> String {
     if n == 1 { format!("1 {what}") } else { format!("{n} {what}s") }
+}
+
+fn beam(beam: &Beam) -> &'static str {
+    match beam {
+        Beam::Point { .. } => "point light",
+        Beam::Spot { .. } => "spot light",
+        Beam::Directional { .. } => "directional light",
+    }
 }
 
 fn geometry(geometry: &Geometry) -> &'static str {

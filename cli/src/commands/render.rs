@@ -254,6 +254,7 @@ fn prepare_row(row: &ByteRow) -> (Op, Kind, u64) {
         ByteKind::Manifest => Kind::Manifest,
         ByteKind::Geometry => Kind::Geometry,
         ByteKind::Attributes => Kind::Attributes,
+        ByteKind::Texture => Kind::Texture,
     };
     (op, kind, row.bytes)
 }

@@ -4,10 +4,10 @@ use std::sync::Arc;
 
 use rayherd_render::film::TILE;
 use rayherd_render::frame::Frame;
-use rayherd_render::light::Lights;
+use rayherd_render::light::{Lights, SkyMap};
 use rayherd_render::path::Context;
 use rayherd_render::ray::Ray;
-use rayherd_render::world::World;
+use rayherd_render::world::{Environment, World};
 use rayherd_scene::grid::Grid;
 use rayherd_scene::manifest::Manifest;
 use rayherd_scene::objects::ObjectStore;
@@ -44,7 +44,17 @@ impl PreparedScene {
         {
             return Err(JobError::Scene("its world names shapes or materials that it lacks; prepare it again".into()));
         }
-        let lights = Lights::new(&world);
+        let sky_map = match &manifest.sky_map {
+            Some(object) => {
+                let map = SkyMap::decode(&objects.get(object)?);
+                Some(Arc::new(map.map_err(|e| JobError::Scene(e.to_string()))?))
+            }
+            None => None,
+        };
+        if sky_map.is_some() != matches!(world.environment, Some(Environment::Map { .. })) {
+            return Err(JobError::Scene("its world and its sky map do not belong together; prepare it again".into()));
+        }
+        let lights = Lights::with_sky_map(&world, sky_map);
         let grid = manifest.grid()?;
         Ok(PreparedScene { manifest, world, lights, grid, objects })
     }
@@ -90,8 +100,9 @@ impl PreparedScene {
         for y in (0..h).step_by(TILE as usize) {
             for x in (0..w).step_by(TILE as usize) {
                 let middle = |a: u32, end: u32| f64::from(a) + 0.5 * f64::from(TILE.min(end - a));
-                let d = frame.camera.direction(middle(x, w), middle(y, h));
-                let ray = Ray { o: frame.camera.origin, tmin: 0.0, d, tmax: f32::INFINITY };
+                // about the middle of a lens
+                let (o, d) = frame.camera.ray(middle(x, w), middle(y, h), || [1 << 31; 2]);
+                let ray = Ray { o, tmin: 0.0, d, tmax: f32::INFINITY };
                 let cell = self.grid.first_cell(&ray);
                 out.push(cell.and_then(|c| c.owners.first().copied()).unwrap_or(first));
             }

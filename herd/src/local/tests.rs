@@ -428,3 +428,42 @@ fn random_faults_change_nothing() {
     // the schedules do what they are for
     assert!(!many || (lost > 100 && redone > 10), "{lost} attempts lost, {redone} tasks computed again");
 }
+
+/// Every kind of emitter: a picture of the sky, a point, a spot, parallel light, a lamp. The same bytes whichever way.
+#[test]
+fn every_emitter_makes_the_same_bytes() {
+    use rayherd_scene::description::{Affine, Beam, Environment, Place};
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("sky.hdr");
+    let mut sky = b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 5 +X 6\n".to_vec();
+    sky.extend((0..30u8).flat_map(|i| [20 + 7 * i, 250 - 5 * i, i, if i == 8 { 133 } else { 126 }]));
+    std::fs::write(&path, sky).unwrap();
+    let turned = Affine([[0.0, 0.6, 0.8, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.8, -0.6, 0.0]]);
+    let position = [0.3, 0.4, 0.9];
+    let (axis, intensity) = ([-0.6, -0.8, 0.0], [0.5, 0.6, 0.7]);
+    let description = rayherd_scene::description::Description {
+        beams: vec![
+            Beam::Point { position, intensity },
+            Beam::Spot { position, axis, intensity: [3.0; 3], beam: 20.0, cutoff: 50.0 },
+            Beam::Directional { direction: [0.0, -0.6, -0.8], irradiance: [1.0, 0.9, 0.8] },
+        ],
+        environment: Some(Environment::Map { path, place: Place::default(), scale: 0.25, to_world: turned }),
+        ..testing::cornell()
+    };
+    let whole = testing::prepared(&description, 1, true);
+    assert!(whole.manifest.sky_map.is_some());
+    let frame = testing::frame(&whole, [24, 16], 2);
+    let settings = JobSettings { kernel: Kernel::Scalar, ..JobSettings::default() };
+    let expected = render_local(&whole, &frame, &sampling(4), &settings, &Silent).unwrap();
+    let dark = rayherd_scene::description::Description { beams: vec![], environment: None, ..testing::cornell() };
+    let dark = testing::prepared(&dark, 1, true);
+    assert!(expected.film != render_local(&dark, &frame, &sampling(4), &settings, &Silent).unwrap().film);
+    for (splits, reduced) in [(5, true), (5, false)] {
+        let scene = testing::prepared(&description, splits, reduced);
+        for strategy in Strategy::ALL {
+            let settings = JobSettings { memory_per_node: Some(2 * largest(&scene)), ..small(strategy, &[2, 1]) };
+            let made = render_local(&scene, &frame, &sampling(4), &settings, &Silent).unwrap();
+            assert!(made.film == expected.film, "{strategy} on {splits} splits");
+        }
+    }
+}

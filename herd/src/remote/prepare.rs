@@ -56,6 +56,9 @@ pub fn prepare_scene(
             put(&on, &split.attributes)?;
         }
         put(&[], &prepared.manifest.world)?;
+        if let Some(map) = &prepared.manifest.sky_map {
+            put(&[], map)?;
+        }
         put(&[], &prepared.reference)?;
         // last: whoever finds the name finds everything that it names
         if let Some((name, object)) = staged.name.lock().unwrap_or_else(PoisonError::into_inner).take() {

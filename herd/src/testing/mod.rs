@@ -5,7 +5,9 @@ use std::sync::Arc;
 use rayherd_render::camera::Camera;
 use rayherd_render::filter::Filter;
 use rayherd_render::frame::Frame;
-use rayherd_scene::description::{Affine, Bsdf, Description, Distribution, Geometry, Material, Place, Shape};
+use rayherd_scene::description::{
+    Affine, Bsdf, Description, Distribution, Environment, Geometry, Material, Place, Shape,
+};
 use rayherd_scene::import::{DescriptionSource, StreamOptions};
 use rayherd_scene::objects::MemoryObjects;
 use rayherd_scene::prepare::{Cut, NoProgress, PrepareSettings, SpoolSettings, prepare};
@@ -81,7 +83,8 @@ pub fn cornell() -> Description {
     Description {
         shapes,
         materials,
-        environment: Some([0.05, 0.06, 0.08]),
+        beams: vec![],
+        environment: Some(Environment::Constant([0.05, 0.06, 0.08])),
         camera: None,
         size: None,
         filter: None,
@@ -140,7 +143,7 @@ pub fn floor(lamp: &Lamp) -> Description {
         }
         Lamp::Sky => {}
     }
-    let environment = matches!(lamp, Lamp::Sky).then_some([1.0; 3]);
+    let environment = matches!(lamp, Lamp::Sky).then_some(Environment::Constant([1.0; 3]));
     Description { shapes, materials: vec![half, black], environment, ..cornell() }
 }
 

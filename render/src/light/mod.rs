@@ -1,20 +1,28 @@
 //! Light sources: choosing one, a point on it, and the density with which that happens.
 //!
-//! A primitive that emits is chosen with a probability that does not depend on where it is seen from: its shape's share times its share of the
-//! shape's area. Nine tenths of the shapes' shares go by power (luminance x area x pi), one tenth is dealt evenly. The probabilities are
-//! multiples of 2^-32, a cumulative table of integers, so one 32-bit number chooses exactly by them and both sides of MIS see the same ones.
+//! A source is a primitive that emits, a [beam](crate::world::Beam), or the sky. One is chosen with a probability that does not depend on
+//! where it is seen from: a primitive's is its shape's share times its share of the shape's area. Nine tenths of the shares of shapes and
+//! beams go by power (luminance x area x pi), one tenth is dealt evenly. The probabilities are multiples of 2^-32, a cumulative table of
+//! integers, so one 32-bit number chooses exactly by them and both sides of MIS see the same ones.
 //! A primitive whose share is below 2^-32 is never chosen; its density is 0, and MIS leaves it to the BSDF.
 
+mod beam;
+mod map;
+mod sky;
 mod sphere;
 #[cfg(test)]
 mod tests;
 mod triangle;
 
+use std::sync::Arc;
+
 use glam::Vec3;
 
-use crate::math::luminance;
+use crate::math::{luminance, unit};
 use crate::ray::PrimId;
-use crate::world::{Primitive, World};
+use crate::world::{Beam, Primitive, World};
+pub use map::{SkyMap, SkyMapError};
+use sky::Sky;
 pub use sphere::SphereLight;
 pub use triangle::TriangleLight;
 
@@ -31,7 +39,7 @@ pub struct Lights {
     ends: Vec<u64>,
     /// By ascending id: the primitive's number in `sources`.
     by_prim: Vec<(PrimId, u32)>,
-    sky: Option<Vec3>,
+    sky: Sky,
     sky_probability: f32,
     only_triangles: bool,
     /// The sources once more, if they are triangles and at most [`FEW`].
@@ -56,6 +64,7 @@ pub(crate) struct FewTriangles {
 #[derive(Clone, Debug)]
 struct Source {
     geometry: Geometry,
+    /// Of the sky its mean.
     emission: Vec3,
     /// With which it is chosen; what the integers in `Lights::ends` say.
     probability: f32,
@@ -65,6 +74,7 @@ struct Source {
 enum Geometry {
     Triangle(TriangleLight),
     Sphere(SphereLight),
+    Beam(Beam),
     Sky,
 }
 
@@ -75,15 +85,21 @@ pub struct LightSample {
     pub d: Vec3,
     /// Nothing nearer than this may be met; smaller than the distance of the source by the error of both.
     pub tmax: f32,
-    /// Radiance arriving from there if nothing is in between.
+    /// Radiance arriving from there if nothing is in between. Of a single direction: irradiance times 2^64.
     pub radiance: Vec3,
-    /// Density in solid angle, the choice included.
+    /// Density in solid angle, the choice included. Of a single direction: 2^64 times the choice's probability, so that `radiance / pdf` is
+    /// right and no other technique's density counts beside it.
     pub pdf: f32,
 }
 
 impl Lights {
-    /// Tables for a world. Primitives without area and emission of zero are left out.
+    /// Tables for a world whose sky is no picture. Primitives without area and emission of zero are left out.
     pub fn new(world: &World) -> Lights {
+        Lights::with_sky_map(world, None)
+    }
+
+    /// Tables for a world and the picture of its sky, which is dark where the world wants one and there is none.
+    pub fn with_sky_map(world: &World, map: Option<Arc<SkyMap>>) -> Lights {
         let mut sources = Vec::new();
         let mut by_prim = Vec::new();
         let mut areas = vec![0.0f64; world.shapes.len()];
@@ -108,22 +124,25 @@ impl Lights {
             sources.push(Source { geometry, emission, probability: 0.0 });
         }
         by_prim.sort_unstable();
-        let sky = world.environment.map(Vec3::from).filter(|c| luminance(*c) > 0.0);
+        let sky = Sky::new(world.environment.as_ref(), map);
         let power =
             |shape: usize| world.shapes[shape].emission.map_or(0.0, |e| f64::from(luminance(e.into()))) * areas[shape];
         let shapes: Vec<usize> = (0..areas.len()).filter(|&s| areas[s] > 0.0).collect();
-        let total: f64 = shapes.iter().map(|&s| power(s)).sum();
-        let sky_share = sky.map_or(0.0, |c| sky_share(c, world, total, shapes.len()));
-        let mut weights: Vec<f64> = chosen
-            .iter()
-            .map(|&(s, area)| {
-                let share = (1.0 - EVEN) * power(s) / total + EVEN / shapes.len() as f64;
-                (1.0 - sky_share) * share * area / areas[s]
-            })
-            .collect();
-        if let Some(emission) = sky {
+        let radius2 = (0..3).map(|i| f64::from(world.hi[i] - world.lo[i]).powi(2)).sum::<f64>() / 4.0;
+        let beams: Vec<(Beam, f64)> =
+            world.beams.iter().filter(|b| beam::shines(b)).map(|b| (*b, beam::power(b, radius2))).collect();
+        let total = shapes.iter().map(|&s| power(s)).sum::<f64>() + beams.iter().map(|b| b.1).sum::<f64>();
+        let others = shapes.len() + beams.len();
+        let sky_share = sky.mean().map_or(0.0, |mean| sky_share(mean, radius2, total, others));
+        let share = |power: f64| (1.0 - sky_share) * ((1.0 - EVEN) * power / total + EVEN / others as f64);
+        let mut weights: Vec<f64> = chosen.iter().map(|&(s, area)| share(power(s)) * area / areas[s]).collect();
+        for (beam, power) in beams {
+            weights.push(share(power));
+            sources.push(Source { geometry: Geometry::Beam(beam), emission: Vec3::ZERO, probability: 0.0 });
+        }
+        if let Some(mean) = sky.mean() {
             weights.push(sky_share);
-            sources.push(Source { geometry: Geometry::Sky, emission, probability: 0.0 });
+            sources.push(Source { geometry: Geometry::Sky, emission: mean, probability: 0.0 });
         }
         let ends = integer_ends(&weights);
         let mut start = 0;
@@ -131,7 +150,7 @@ impl Lights {
             source.probability = ((end - start) as f64 / 4_294_967_296.0) as f32;
             start = end;
         }
-        let sky_probability = sky.map_or(0.0, |_| sources.last().map_or(0.0, |s| s.probability));
+        let sky_probability = sky.mean().map_or(0.0, |_| sources.last().map_or(0.0, |s| s.probability));
         let only_triangles = !sources.is_empty() && sources.iter().all(|s| matches!(s.geometry, Geometry::Triangle(_)));
         let few = if only_triangles && sources.len() <= FEW { few_triangles(&sources, &ends) } else { Vec::new() };
         Lights { sources, ends, by_prim, sky, sky_probability, only_triangles, few }
@@ -142,21 +161,38 @@ impl Lights {
         self.sources.is_empty()
     }
 
-    /// Radiance of the sky, 0 if there is none.
-    pub fn sky(&self) -> Vec3 {
-        self.sky.unwrap_or(Vec3::ZERO)
+    /// Whether anything comes from where nothing is met.
+    #[inline]
+    pub(crate) fn has_sky(&self) -> bool {
+        !matches!(self.sky, Sky::None)
     }
 
-    /// A direction from `o` to a source, by a number for the choice and two in [0, 1) for the place. `None` when what was chosen shows
+    /// Radiance from the sky along the unit direction `d`, and the density of [`Lights::sample`] in that direction; both 0 without a sky.
+    #[inline]
+    pub fn sky(&self, d: Vec3) -> (Vec3, f32) {
+        let (radiance, pdf) = self.sky.look_up(d);
+        (radiance, pdf * self.sky_probability)
+    }
+
+    /// A direction from `o` to a source, by random bits: one number for the choice and two for the place. `None` when what was chosen shows
     /// `o` its back: that sample is worth 0.
     #[inline]
-    pub fn sample(&self, o: Vec3, choice: u32, u: [f32; 2]) -> Option<LightSample> {
+    pub fn sample(&self, o: Vec3, choice: u32, place: [u32; 2]) -> Option<LightSample> {
         let i = self.choose(choice)?;
         let source = &self.sources[i];
+        let u = place.map(unit);
         let (d, tmax, pdf) = match &source.geometry {
             Geometry::Triangle(t) => t.sample(o, u)?,
             Geometry::Sphere(s) => s.sample(o, u)?,
-            Geometry::Sky => (sphere::uniform(u), f32::INFINITY, sphere::UNIFORM_PDF),
+            Geometry::Beam(beam) => {
+                let (d, tmax, irradiance) = beam::sample(beam, o)?;
+                let radiance = irradiance * beam::SINGLE;
+                return Some(LightSample { d, tmax, radiance, pdf: beam::SINGLE * source.probability });
+            }
+            Geometry::Sky => {
+                let (d, radiance, pdf) = self.sky.sample(place)?;
+                return Some(LightSample { d, tmax: f32::INFINITY, radiance, pdf: pdf * source.probability });
+            }
         };
         Some(LightSample { d, tmax, radiance: source.emission, pdf: pdf * source.probability })
     }
@@ -193,15 +229,9 @@ impl Lights {
         let pdf = match &source.geometry {
             Geometry::Triangle(s) => s.pdf(t, cos),
             Geometry::Sphere(s) => s.pdf(o, t, cos),
-            Geometry::Sky => 0.0,
+            Geometry::Beam(_) | Geometry::Sky => 0.0,
         };
         pdf * source.probability
-    }
-
-    /// Density of [`Lights::sample`] in a direction that meets nothing.
-    #[inline]
-    pub fn sky_pdf(&self) -> f32 {
-        self.sky_probability * sphere::UNIFORM_PDF
     }
 
     /// The source in whose interval the number lies.
@@ -222,7 +252,7 @@ impl Geometry {
         match self {
             Geometry::Triangle(t) => t.area(),
             Geometry::Sphere(s) => s.area(),
-            Geometry::Sky => 0.0,
+            Geometry::Beam(_) | Geometry::Sky => 0.0,
         }
     }
 }
@@ -244,14 +274,13 @@ fn few_triangles(sources: &[Source], ends: &[u64]) -> Vec<FewTriangles> {
 
 /// The sky's share of the choice: all when it is alone, else by the power that enters the scene's bounding sphere, but at most
 /// [`SKY_LIMIT`] (a sky outside a closed room would take every sample).
-fn sky_share(sky: Vec3, world: &World, others: f64, shapes: usize) -> f64 {
-    if shapes == 0 {
+fn sky_share(sky: Vec3, radius2: f64, others: f64, count: usize) -> f64 {
+    if count == 0 {
         return 1.0;
     }
-    let diagonal: f64 = (0..3).map(|i| f64::from(world.hi[i] - world.lo[i]).powi(2)).sum();
     // pi L x pi R^2 against pi L x area
-    let power = f64::from(luminance(sky)) * std::f64::consts::PI * diagonal / 4.0;
-    let share = (1.0 - EVEN) * power / (power + others) + EVEN / (shapes + 1) as f64;
+    let power = f64::from(luminance(sky)) * std::f64::consts::PI * radius2;
+    let share = (1.0 - EVEN) * power / (power + others) + EVEN / (count + 1) as f64;
     if share < SKY_LIMIT { share } else { SKY_LIMIT }
 }
 

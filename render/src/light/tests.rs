@@ -2,10 +2,10 @@ use glam::Vec3;
 
 use super::*;
 use crate::material::{Bsdf, Material};
-use crate::math::{UnitDir, unit};
+use crate::math::UnitDir;
 use crate::sampler::Stream;
 use crate::testing::{Rng, chi_square, integrate_bins, sphere_bin};
-use crate::world::{EmissivePrimitive, ShapeInfo};
+use crate::world::{EmissivePrimitive, Environment, ShapeInfo};
 
 /// A world of emissive primitives, each of the shape and the radiance given.
 fn world(primitives: &[(Primitive, u32)], radiances: &[f32], environment: Option<[f32; 3]>) -> World {
@@ -24,7 +24,8 @@ fn world(primitives: &[(Primitive, u32)], radiances: &[f32], environment: Option
             .enumerate()
             .map(|(i, &(geometry, shape))| EmissivePrimitive { prim: 10 + 3 * i as u64, shape, geometry })
             .collect(),
-        environment,
+        beams: vec![],
+        environment: environment.map(Environment::Constant),
         lo: [-2.0; 3],
         hi: [2.0; 3],
     }
@@ -74,7 +75,7 @@ fn density(lights: &Lights, primitives: &[(Primitive, u32)], o: Vec3, d: Vec3) -
             }
         }
     }
-    sum + f64::from(lights.sky_pdf())
+    sum + f64::from(lights.sky(d.as_vec3()).1)
 }
 
 /// Directions, after snapping, are distributed as the density, which the other side of MIS uses.
@@ -90,7 +91,7 @@ fn samples_follow_the_density() {
             let mut outside = 0.0;
             let mut rng = Rng(seed);
             for _ in 0..n {
-                match lights.sample(o, rng.u32(), [rng.f32(), rng.f32()]) {
+                match lights.sample(o, rng.u32(), [rng.u32(), rng.u32()]) {
                     Some(s) => {
                         let d = Vec3::from(UnitDir::encode(s.d.to_array()).decode());
                         counts[sphere_bin(d, bins)] += 1.0;
@@ -122,14 +123,14 @@ fn both_sides_agree() {
     for _ in 0..100_000 {
         let o = rng.vec3(1.9);
         let choice = rng.u32();
-        let Some(s) = lights.sample(o, choice, [rng.f32(), rng.f32()]) else { continue };
+        let Some(s) = lights.sample(o, choice, [rng.u32(), rng.u32()]) else { continue };
         assert!((s.d.length() - 1.0).abs() < 1e-6 && s.pdf > 0.0 && s.pdf.is_finite() && s.tmax >= 0.0);
         let i = lights.choose(choice).unwrap();
         if i >= primitives.len() {
-            assert!((s.pdf / lights.sky_pdf() - 1.0).abs() < 1e-6 && s.tmax == f32::INFINITY);
+            assert!((s.pdf / lights.sky(s.d).1 - 1.0).abs() < 1e-6 && s.tmax == f32::INFINITY);
             continue;
         }
-        let alone = density(&lights, &primitives, o, s.d) - f64::from(lights.sky_pdf());
+        let alone = density(&lights, &primitives, o, s.d) - f64::from(lights.sky(s.d).1);
         // other sources may lie in the same direction, and at a rim rounding decides
         if alone < f64::from(s.pdf) * 0.99 {
             continue;
@@ -148,7 +149,7 @@ fn triangle_density_is_exact() {
     let mut rng = Rng(5);
     for _ in 0..10_000 {
         let o = Vec3::new(rng.range(-3.0, 3.0), rng.range(-3.0, 1.9), rng.range(-3.0, 3.0));
-        let Some(s) = lights.sample(o, rng.u32(), [rng.f32(), rng.f32()]) else { continue };
+        let Some(s) = lights.sample(o, rng.u32(), [rng.u32(), rng.u32()]) else { continue };
         let t = (2.0 - o.y) / s.d.y;
         let pdf = lights.pdf(10, o, t, s.d.y);
         assert!((s.pdf / pdf - 1.0).abs() < 1e-5, "{} {pdf}", s.pdf);
@@ -176,7 +177,7 @@ fn choice_is_by_power() {
         assert!((counts[i] / f64::from(n) - expected[i]).abs() < 2e-5, "{counts:?} {expected:?}");
         assert!((f64::from(lights.sources[i].probability) - expected[i]).abs() < 1e-7);
     }
-    assert!(lights.sample(Vec3::new(0.0, 3.0, 0.0), 0, [0.5, 0.5]).is_none());
+    assert!(lights.sample(Vec3::new(0.0, 3.0, 0.0), 0, [1 << 31; 2]).is_none());
     assert_eq!(lights.choose(u32::MAX), Some(2));
     assert_eq!(lights.pdf(11, Vec3::ZERO, 1.0, 1.0), 0.0);
 }
@@ -185,9 +186,9 @@ fn choice_is_by_power() {
 #[test]
 fn odd_worlds() {
     assert!(Lights::new(&world(&[], &[], None)).is_empty());
-    assert!(Lights::new(&world(&[], &[], None)).sample(Vec3::ZERO, 7, [0.5; 2]).is_none());
+    assert!(Lights::new(&world(&[], &[], None)).sample(Vec3::ZERO, 7, [1 << 31; 2]).is_none());
     let sky = Lights::new(&world(&[], &[], Some([1.0; 3])));
-    assert!((sky.sky_pdf() - 1.0 / (4.0 * std::f32::consts::PI)).abs() < 1e-7);
+    assert!((sky.sky(Vec3::X).1 - 1.0 / (4.0 * std::f32::consts::PI)).abs() < 1e-7);
     let flat = Primitive::Triangle([[0.0; 3]; 3]);
     assert!(Lights::new(&world(&[(flat, 0)], &[1.0], None)).is_empty());
     assert!(Lights::new(&world(&mixed(), &[0.0; 4], None)).is_empty());
@@ -210,7 +211,7 @@ fn many_sources() {
     let samples = 1 << 14;
     for i in 0..samples {
         let v = Stream::new(1, 2, 2 * i).vertex(1, 1, 0);
-        let s = lights.sample(Vec3::ZERO, v[6], [unit(v[4]), unit(v[5])]).unwrap();
+        let s = lights.sample(Vec3::ZERO, v[6], [v[4], v[5]]).unwrap();
         sum += f64::from(s.d.y / s.pdf);
     }
     // half of the square's irradiance: the triangles fill half of it, evenly. The square [0, 1]^2 at height 1 (Siegel and Howell, corner factor):
@@ -230,4 +231,81 @@ fn uniform_sphere_is_uniform() {
         counts[sphere_bin(sphere::uniform([rng.f32(), rng.f32()]), bins)] += 1.0;
     }
     chi_square(&counts, &vec![f64::from(n) / counts.len() as f64; counts.len()]);
+}
+
+/// A direction as it travels.
+fn snapped(d: Vec3) -> glam::DVec3 {
+    Vec3::from(UnitDir::encode(d.to_array()).decode()).as_dvec3()
+}
+
+/// What is met on a triangle is even over its area: chi-square over sub-triangles of one size, after snapping.
+#[test]
+fn triangle_samples_are_even_by_area() {
+    let v = [[-1.0, 2.0, -1.0], [1.0, 2.5, -1.0], [0.0, 2.0, 1.5]];
+    let lights = Lights::new(&world(&[(Primitive::Triangle(v), 0)], &[1.0], None));
+    let [a, b, c] = v.map(|p| Vec3::from(p).as_dvec3());
+    let (e1, e2) = (b - a, c - a);
+    let n = e1.cross(e2);
+    let mut rng = Rng(21);
+    for o in [Vec3::new(0.2, -1.0, 0.1), Vec3::new(3.0, 1.5, 2.0), Vec3::new(0.0, 1.9, 0.0)] {
+        const SIDE: usize = 16;
+        let mut counts = vec![0.0; SIDE * SIDE];
+        let samples = 200_000;
+        for _ in 0..samples {
+            let s = lights.sample(o, rng.u32(), [rng.u32(), rng.u32()]).expect("in front of it");
+            let (o, d) = (o.as_dvec3(), snapped(s.d));
+            let p = o + d * ((a - o).dot(n) / d.dot(n)) - a;
+            let (u, v) = (p.cross(e2).dot(n) / n.length_squared(), e1.cross(p).dot(n) / n.length_squared());
+            // sub-triangle of a grid of SIDE by SIDE: two in a cell, of which those beyond the long side are folded in
+            let cell = |x: f64| ((x * SIDE as f64) as usize).min(SIDE - 1);
+            let (i, j) = (cell(u), cell(v));
+            let upper = u * SIDE as f64 - i as f64 + (v * SIDE as f64 - j as f64) > 1.0;
+            let (i, j) = if upper { (SIDE - 1 - i, SIDE - 1 - j) } else { (i, j) };
+            counts[i * SIDE + j] += 1.0;
+        }
+        chi_square(&counts, &vec![f64::from(samples) / counts.len() as f64; counts.len()]);
+    }
+}
+
+/// From outside directions are even over the cone that the sphere fills; from inside what is met is even over its surface.
+#[test]
+fn sphere_samples_are_even() {
+    let mut rng = Rng(22);
+    let samples = 200_000;
+    let center = Vec3::new(0.5, 1.0, -0.5);
+    for (o, radius) in [(Vec3::new(-3.0, 0.0, 2.0), 0.7f32), (Vec3::new(0.5, 1.0, 0.6), 1.0)] {
+        let sphere = Primitive::Sphere { center: center.to_array(), radius, flipped: false };
+        let lights = Lights::new(&world(&[(sphere, 0)], &[1.0], None));
+        let to = (center - o).as_dvec3();
+        let sin2 = f64::from(radius).powi(2) / to.length_squared();
+        let cone = sin2 / (1.0 + (1.0 - sin2).sqrt()); // 1 - cos
+        let axis = to.normalize();
+        let side = axis.any_orthonormal_vector();
+        let (rings, sectors) = (16, 16);
+        let mut counts = vec![0.0; rings * sectors];
+        for _ in 0..samples {
+            let s = lights.sample(o, rng.u32(), [rng.u32(), rng.u32()]).expect("seen from outside");
+            let d = snapped(s.d);
+            // 1 - cos of the angle to the axis, without cancelling
+            let below = 0.5 * (d - axis).length_squared();
+            assert!(below < cone * (1.0 + 1e-4), "{below} {cone}");
+            let ring = ((below / cone * rings as f64) as usize).min(rings - 1);
+            let turn = d.dot(axis.cross(side)).atan2(d.dot(side)) / (2.0 * std::f64::consts::PI) + 0.5;
+            counts[ring * sectors + ((turn * sectors as f64) as usize).min(sectors - 1)] += 1.0;
+        }
+        chi_square(&counts, &vec![f64::from(samples) / counts.len() as f64; counts.len()]);
+    }
+    let inside = Primitive::Sphere { center: center.to_array(), radius: 2.0, flipped: true };
+    let lights = Lights::new(&world(&[(inside, 0)], &[1.0], None));
+    let o = Vec3::new(1.2, 0.4, 0.3);
+    let bins = 12;
+    let mut counts = vec![0.0; 2 * bins * bins];
+    for _ in 0..samples {
+        let s = lights.sample(o, rng.u32(), [rng.u32(), rng.u32()]).expect("seen from inside");
+        let (d, f) = (snapped(s.d), (o - center).as_dvec3());
+        let (b, c) = (f.dot(d), f.length_squared() - 4.0);
+        let n = (f + d * (-b + (b * b - c).sqrt())) / 2.0;
+        counts[sphere_bin(n.as_vec3(), bins)] += 1.0;
+    }
+    chi_square(&counts, &vec![f64::from(samples) / counts.len() as f64; counts.len()]);
 }

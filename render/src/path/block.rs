@@ -74,6 +74,8 @@ pub(super) struct Block {
     direction: [Lanes; 2],
     go_on: Lanes,
     place: [Lanes; 2],
+    /// The bits that `place` was made from.
+    place_bits: [[u32; N]; 2],
     choice: [u32; N],
     roulette: [bool; N],
     // of the light chosen
@@ -126,6 +128,7 @@ impl Default for Block {
             direction: [lanes; 2],
             go_on: lanes,
             place: [lanes; 2],
+            place_bits: [[0; N]; 2],
             choice: [0; N],
             roulette: [false; N],
             light_p0: Lanes3::ZERO,
@@ -249,6 +252,7 @@ impl Block {
                 lanes[i] = unit(raw[i]);
             }
         }
+        self.place_bits = [raw[2], raw[3]];
     }
 
     #[inline(always)]
@@ -331,7 +335,7 @@ impl Block {
             if matches!(context.lights.chosen(self.choice[i]), Some((Some(_), ..))) {
                 continue;
             }
-            let place = [self.place[0][i], self.place[1][i]];
+            let place = [self.place_bits[0][i], self.place_bits[1][i]];
             let light = context.lights.sample(self.origin.get(i), self.choice[i], place);
             self.lit[i] = light.is_some();
             if let Some(light) = light {

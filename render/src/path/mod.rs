@@ -198,12 +198,14 @@ impl Counters {
 #[inline]
 pub fn camera_ray(frame: &Frame, pixel: u32, sample: u32) -> PathRay {
     let [width, _] = frame.size;
-    let [u, v] = Stream::new(frame.seed, pixel, sample).film();
+    let stream = Stream::new(frame.seed, pixel, sample);
+    let [u, v] = stream.film();
     let x = f64::from(pixel % width) + 0.5 + frame.filter.offset(u);
     let y = f64::from(pixel / width) + 0.5 + frame.filter.offset(v);
+    let (o, d) = frame.camera.ray(x, y, || stream.lens());
     PathRay {
-        o: frame.camera.origin,
-        dir: UnitDir::encode(frame.camera.direction(x, y)),
+        o,
+        dir: UnitDir::encode(d),
         key: PathKey { pixel, sample, branch: 0, vertex: 0 },
         throughput: Vec3::ONE.to_array(),
         pdf: 0.0,

@@ -35,7 +35,8 @@ pub fn camera_rays(frame: &Frame, samples: &[[u32; 2]], paths: &mut Vec<PathRay>
     let o = frame.camera.origin;
     let (mut last, mut corner) = (None, [0.0; 2]);
     for part in samples.chunks(N) {
-        if part.len() < 4 {
+        // a lens is no matter of speed yet
+        if part.len() < 4 || !frame.camera.lens.is_pinhole() {
             for &[pixel, sample] in part {
                 let path = camera_ray(frame, pixel, sample);
                 paths.push(path);

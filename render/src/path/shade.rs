@@ -37,12 +37,13 @@ pub fn shade_traced<S: Surfaces>(
 ) {
     let mut block = out.block.take().unwrap_or_default();
     out.counters.shaded += rays.len() as u64;
-    let (sky, sky_pdf) = (context.lights.sky(), context.lights.sky_pdf());
+    let has_sky = context.lights.has_sky();
     for (index, ((ray, traced), hit)) in rays.iter().zip(traced).zip(hits).enumerate() {
         if !hit.is_hit() {
             out.counters.missed += 1;
-            if sky != Vec3::ZERO {
-                emit(ray, sky, sky_pdf, out);
+            if has_sky {
+                let (radiance, pdf) = context.lights.sky(traced.d.into());
+                emit(ray, radiance, pdf, out);
             }
             continue;
         }
@@ -84,7 +85,8 @@ pub(super) fn shade_plain<S: Surfaces>(
         out.counters.shaded += 1;
         if !hit.is_hit() {
             out.counters.missed += 1;
-            emit(ray, context.lights.sky(), context.lights.sky_pdf(), out);
+            let (radiance, pdf) = context.lights.sky(ray.dir.decode().into());
+            emit(ray, radiance, pdf, out);
             continue;
         }
         let Some(leaving) = arrive(context, surfaces, index, ray, hit, out) else { continue };
@@ -209,7 +211,7 @@ pub(super) fn scatter_plain(
     let go_on = unit(numbers[ROULETTE]);
     let siblings = frame.split as f32;
 
-    let place = [unit(numbers[LIGHT]), unit(numbers[LIGHT + 1])];
+    let place = [numbers[LIGHT], numbers[LIGHT + 1]];
     let light =
         if material.bsdf.is_delta() { None } else { context.lights.sample(origin, numbers[LIGHT_CHOICE], place) };
     let shadow = |o: Vec3, dir: UnitDir, tmax: f32, contribution: Vec3, out: &mut Outcome| {

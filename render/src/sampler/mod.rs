@@ -39,6 +39,8 @@ pub const LIGHT_CHOICE: usize = 6;
 /// Numbers of a vertex.
 pub const PER_VERTEX: usize = 8;
 
+/// In place of a vertex's number, which stays below 2^16: the lens.
+const LENS: u32 = 1 << 16;
 /// Vertices that the sequence serves before padding.
 const FULL_VERTICES: u32 = ((DIMENSIONS - 2) / PER_VERTEX) as u32;
 /// Where dimensions 0 to 3 stand in [`TABLE`].
@@ -67,6 +69,13 @@ impl Stream {
     #[inline(always)]
     pub fn film(&self) -> [u32; 2] {
         film_numbers(self.index, film_keys(self.key))
+    }
+
+    /// The two numbers of the place on a lens: padded, so that no other dimension moves.
+    #[inline]
+    pub fn lens(&self) -> [u32; 2] {
+        let [a, b, ..] = self.vertex(LENS, 1, 0);
+        [a, b]
     }
 
     /// The eight numbers of vertex `vertex` (1: first hit) of child `child` of `split`.

@@ -7,7 +7,7 @@ use super::isosurface::IsoSurfaceSource;
 use super::mesh::extension;
 use super::{DEFAULT_ALBEDO, ImportOptions, refuse};
 use crate::ImportError;
-use crate::description::{Affine, Bsdf, Description, Geometry, Material, MeshFormat, Place, Shape};
+use crate::description::{Affine, Bsdf, Description, Environment, Geometry, Material, MeshFormat, Place, Shape};
 
 /// The mesh format that a file's name says.
 pub(super) fn mesh_format(path: &Path) -> Option<MeshFormat> {
@@ -74,7 +74,7 @@ fn description(options: &ImportOptions) -> Description {
     let bsdf = Bsdf::Diffuse { reflectance: options.albedo.unwrap_or(DEFAULT_ALBEDO) };
     Description {
         materials: vec![Material { name: "surface".into(), bsdf, two_sided: true }],
-        environment: Some(framing::SKY),
+        environment: Some(Environment::Constant(framing::SKY)),
         size: Some(options.size.unwrap_or(framing::SIZE)),
         ..Description::default()
     }

@@ -15,6 +15,7 @@ mod placement;
 mod ply;
 mod refraction;
 mod shapes;
+mod sky;
 mod source;
 mod spill;
 mod stl;
@@ -31,12 +32,14 @@ pub use options::{
     CameraView, DEFAULT_ALBEDO, ImportOptions, Light, OptionError, parse_albedo, parse_define, parse_radiance,
 };
 pub use placement::Placement;
+pub use sky::sky_map;
+pub(crate) use sky::to_map;
 pub(crate) use spill::temporary_file;
 pub use stream::{DescriptionSource, StreamOptions};
 pub use survey::{ShapeSurvey, Survey};
 
 use crate::ImportError;
-use crate::description::{Bsdf, Description, Material, MeshFormat, Place};
+use crate::description::{Bsdf, Description, Environment, Material, MeshFormat, Place};
 use framing::Up;
 
 /// What a path holds.
@@ -56,10 +59,13 @@ pub fn import(path: &Path, options: &ImportOptions) -> Result<Description, Impor
     let (mut out, up, bare) = read(path, options)?;
     place_camera(path, &mut out, up, bare, options)?;
     if let Some(sky) = options.sky {
-        out.environment = Some(sky);
+        out.environment = Some(Environment::Constant(sky));
     }
-    out.environment = out.environment.filter(|rgb| rgb.iter().any(|v| *v > 0.0));
-    if out.environment.is_none() && out.shapes.iter().all(|s| s.emission.is_none()) {
+    out.environment = out.environment.filter(|sky| match sky {
+        Environment::Constant(rgb) => rgb.iter().any(|v| *v > 0.0),
+        Environment::Map { .. } => true,
+    });
+    if out.environment.is_none() && out.beams.is_empty() && out.shapes.iter().all(|s| s.emission.is_none()) {
         return refuse(
             path,
             "nothing in this scene emits light, its image is black: add an emitter, or pass --light or --sky",

@@ -16,7 +16,7 @@ use crate::prepare::PrepareSettings;
 
 /// Version of the manifest and of everything it names. A change of any layout, of recentring, of the order of records
 /// or of the grid's rules changes it; scenes of other versions are prepared again.
-pub const FORMAT: u32 = 2;
+pub const FORMAT: u32 = 3;
 
 /// A prepared scene. Its bytes are canonical ([`Manifest::encode`]); its name is their hash.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -39,6 +39,8 @@ pub struct Manifest {
     pub hi: [f32; 3],
     /// The world object: [`rayherd_render::world::World`] as JSON, put as [`ObjectKind::Manifest`].
     pub world: ObjectRef,
+    /// The picture of the sky, [`rayherd_render::light::SkyMap`], if the world has one; put as [`ObjectKind::Texture`].
+    pub sky_map: Option<ObjectRef>,
     /// Splits by number: those cut from the source, in its order, then the copied ones.
     pub splits: Vec<SplitEntry>,
     /// The scheduling grid.
@@ -256,7 +258,9 @@ impl Manifest {
 
     /// Every object that it names, but itself.
     pub fn objects(&self) -> impl Iterator<Item = &ObjectRef> {
-        std::iter::once(&self.world).chain(self.splits.iter().flat_map(|s| [&s.geometry, &s.attributes]))
+        std::iter::once(&self.world)
+            .chain(&self.sky_map)
+            .chain(self.splits.iter().flat_map(|s| [&s.geometry, &s.attributes]))
     }
 
     /// Geometry and attribute bytes, copies left out: what a pass over the scene reads.

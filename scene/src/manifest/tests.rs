@@ -36,6 +36,7 @@ pub(crate) fn sample() -> Manifest {
         lo: [-1.0; 3],
         hi: [1.0; 3],
         world: object("world"),
+        sky_map: Some(object("sky")),
         splits: vec![split(0, false), split(1, false), split(2, true)],
         grid: GridData {
             subdiv: 2,
@@ -84,6 +85,7 @@ fn a_scene_is_found_only_when_it_is_whole() {
     let name = manifest.store(&store).unwrap();
     assert!(find(&store, &manifest).is_none(), "its objects are missing");
     store.put(ObjectKind::Manifest, b"world").unwrap();
+    store.put(ObjectKind::Texture, b"sky").unwrap();
     for i in 0..3 {
         store.put(ObjectKind::Geometry, format!("geometry {i}").as_bytes()).unwrap();
         store.put(ObjectKind::Attributes, format!("attributes {i}").as_bytes()).unwrap();

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use std::time::UNIX_EPOCH;
 
 use crate::ImportError;
-use crate::description::{Description, Geometry};
+use crate::description::{Description, Environment, Geometry};
 use crate::objects::ObjectHash;
 
 /// Fingerprint of a source: the hash of its description and, for every file it names (for a folder: every file in
@@ -23,7 +23,7 @@ pub fn fingerprint(description: &Description) -> Result<ObjectHash, ImportError>
         path: PathBuf::new(),
         message: format!("the description cannot be written down: {e}"),
     })?);
-    let files: BTreeSet<&Path> = description
+    let mut files: BTreeSet<&Path> = description
         .shapes
         .iter()
         .filter_map(|shape| match &shape.geometry {
@@ -31,6 +31,9 @@ pub fn fingerprint(description: &Description) -> Result<ObjectHash, ImportError>
             Geometry::Inline { .. } | Geometry::Sphere { .. } => None,
         })
         .collect();
+    if let Some(Environment::Map { path, .. }) = &description.environment {
+        files.insert(path);
+    }
     for file in files {
         add(&mut hasher, file, true)?;
     }

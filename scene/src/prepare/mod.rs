@@ -33,13 +33,14 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use rayherd_render::bvh::BuildError;
-use rayherd_render::world::{ShapeInfo, World};
+use rayherd_render::world::{Beam, Environment, ShapeInfo, World};
 use rayon::prelude::*;
 
 use crate::ImportError;
-use crate::description::Description;
+use crate::description::{self, Description};
 use crate::grid::count::{Counter, Primitives, candidates, choose};
 use crate::grid::{CellData, GridData, Lattice};
+use crate::import;
 use crate::manifest::{Counts, Defaults, FORMAT, GridChoice, Manifest, ManifestError, SplitEntry};
 use crate::objects::{ObjectError, ObjectHash, ObjectKind, ObjectRef, ObjectStore};
 use crate::overlap;
@@ -153,9 +154,13 @@ pub fn prepare(
 
     // 1, 2
     let (offset, mut ingested) = read(description, source, spool, progress)?;
-    let world = world(description, &mut ingested)?;
+    let world = world(description, &offset, &mut ingested)?;
     let world_bytes = serde_json::to_vec(&world).map_err(|e| PrepareError::Inconsistent(e.to_string()))?;
-    let content = content_hash(&offset, &ingested.hash, &world_bytes);
+    let sky_map = match import::sky_map(description.environment.as_ref())? {
+        Some(map) => Some(store.put(ObjectKind::Texture, &map.encode())?),
+        None => None,
+    };
+    let content = content_hash(&offset, &ingested.hash, &world_bytes, sky_map.as_ref());
     let inner = ingested.inner();
     let Ingested { spool, counts, lo, hi, .. } = ingested;
     let spool_error = |source| PrepareError::Spool { folder: spool.folder().clone(), source };
@@ -213,6 +218,7 @@ pub fn prepare(
         lo,
         hi,
         world,
+        sky_map,
         splits,
         grid,
         choice,
@@ -253,7 +259,7 @@ fn read(
     Ok((offset, ingested))
 }
 
-fn world(description: &Description, ingested: &mut Ingested) -> Result<World, PrepareError> {
+fn world(description: &Description, offset: &[f64; 3], ingested: &mut Ingested) -> Result<World, PrepareError> {
     let materials = description.materials.len();
     if let Some(shape) = description.shapes.iter().find(|s| s.material as usize >= materials) {
         let message = format!("shape {:?} has material {} of {materials}", shape.name, shape.material);
@@ -268,19 +274,48 @@ fn world(description: &Description, ingested: &mut Ingested) -> Result<World, Pr
         materials: description.materials.clone(),
         shapes: shapes.collect(),
         emissive: std::mem::take(&mut ingested.emissive),
-        environment: description.environment,
+        beams: description.beams.iter().map(|b| beam(b, offset)).collect(),
+        environment: description.environment.as_ref().map(|sky| match sky {
+            description::Environment::Constant(radiance) => Environment::Constant(*radiance),
+            description::Environment::Map { scale, to_world, .. } => {
+                Environment::Map { scale: *scale, to_map: import::to_map(to_world) }
+            }
+        }),
         lo: ingested.lo,
         hi: ingested.hi,
     })
 }
 
-fn content_hash(offset: &[f64; 3], records: &blake3::Hash, world: &[u8]) -> ObjectHash {
+/// A beam in recentred f32.
+fn beam(beam: &description::Beam, offset: &[f64; 3]) -> Beam {
+    let place = |p: &[f64; 3]| std::array::from_fn(|i| (p[i] - offset[i]) as f32);
+    match beam {
+        description::Beam::Point { position, intensity } => {
+            Beam::Point { position: place(position), intensity: *intensity }
+        }
+        description::Beam::Spot { position, axis, intensity, beam, cutoff } => Beam::Spot {
+            position: place(position),
+            axis: axis.map(|x| x as f32),
+            intensity: *intensity,
+            beam: beam.to_radians() as f32,
+            cutoff: cutoff.to_radians() as f32,
+        },
+        description::Beam::Directional { direction, irradiance } => {
+            Beam::Directional { direction: direction.map(|x| x as f32), irradiance: *irradiance }
+        }
+    }
+}
+
+fn content_hash(offset: &[f64; 3], records: &blake3::Hash, world: &[u8], sky_map: Option<&ObjectRef>) -> ObjectHash {
     let mut hasher = blake3::Hasher::new();
     hasher.update(b"rayherd content\0").update(&FORMAT.to_le_bytes());
     for x in offset {
         hasher.update(&x.to_le_bytes());
     }
     hasher.update(records.as_bytes()).update(world);
+    if let Some(map) = sky_map {
+        hasher.update(&map.hash.0);
+    }
     ObjectHash(*hasher.finalize().as_bytes())
 }
 

@@ -53,6 +53,8 @@ pub enum ByteKind {
     Geometry,
     /// Attribute objects.
     Attributes,
+    /// The picture of the sky.
+    Texture,
 }
 
 impl PrepareReport {
@@ -64,6 +66,7 @@ impl PrepareReport {
             (ByteOp::Write, ByteKind::Manifest, store.written(ObjectKind::Manifest)),
             (ByteOp::Write, ByteKind::Geometry, store.written(ObjectKind::Geometry)),
             (ByteOp::Write, ByteKind::Attributes, store.written(ObjectKind::Attributes)),
+            (ByteOp::Write, ByteKind::Texture, store.written(ObjectKind::Texture)),
         ];
         let rows = rows.into_iter().filter(|r| r.2 > 0).map(|(op, kind, bytes)| ByteRow { op, kind, bytes });
         PrepareReport { bytes: rows.collect(), tree_s: tree.as_secs_f64() }

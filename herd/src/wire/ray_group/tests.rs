@@ -6,7 +6,7 @@ use rayherd_render::light::Lights;
 use rayherd_render::material::{Bsdf, Material};
 use rayherd_render::path::{Context, Outcome, Surface, Surfaces, shade};
 use rayherd_render::ray::{Hit, PrimId, Ray};
-use rayherd_render::world::{EmissivePrimitive, Primitive, ShapeInfo, World};
+use rayherd_render::world::{EmissivePrimitive, Environment, Primitive, ShapeInfo, World};
 use rayherd_tests::mutation;
 
 use super::*;
@@ -203,7 +203,8 @@ impl Heap {
             materials: (0..n).map(material).collect(),
             shapes: (0..n).map(shape).collect(),
             emissive: vec![EmissivePrimitive { prim: 1, shape: 1, geometry: sphere(self.spheres[1]) }],
-            environment: Some([0.5; 3]),
+            beams: vec![],
+            environment: Some(Environment::Constant([0.5; 3])),
             lo: [-1001.0; 3],
             hi: [1001.0; 3],
         }

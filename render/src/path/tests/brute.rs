@@ -1,16 +1,19 @@
 //! Every primitive tried with every ray: the plainest intersector, with the kernel's rules (watertight triangles, ties to the
 //! smaller id).
 
+use std::sync::Arc;
+
 use glam::Vec3;
 
 use crate::camera::Camera;
 use crate::filter::Filter;
 use crate::frame::Frame;
+use crate::light::{Lights, SkyMap};
 use crate::material::{Bsdf, Material};
 use crate::path::reference::Tracer;
 use crate::path::{Surface, Surfaces};
 use crate::ray::{Hit, MISS, PrimId, Ray};
-use crate::world::{EmissivePrimitive, Primitive, ShapeInfo, World};
+use crate::world::{Beam, EmissivePrimitive, Environment, Primitive, ShapeInfo, World};
 
 /// A scene in a list.
 #[derive(Default)]
@@ -19,7 +22,10 @@ pub struct Scene {
     pub normals: Vec<Option<[[f32; 3]; 3]>>,
     pub materials: Vec<Material>,
     pub shapes: Vec<ShapeInfo>,
+    pub beams: Vec<Beam>,
     pub environment: Option<[f32; 3]>,
+    /// In place of `environment`: a picture, and rows of the rotation to it.
+    pub sky_map: Option<(Arc<SkyMap>, [[f32; 3]; 3])>,
 }
 
 impl Scene {
@@ -70,10 +76,20 @@ impl Scene {
             materials: self.materials.clone(),
             shapes: self.shapes.clone(),
             emissive,
-            environment: self.environment,
+            beams: self.beams.clone(),
+            environment: match &self.sky_map {
+                Some((_, to_map)) => Some(Environment::Map { scale: 1.0, to_map: *to_map }),
+                None => self.environment.map(Environment::Constant),
+            },
             lo: lo.to_array(),
             hi: hi.to_array(),
         }
+    }
+}
+
+impl Scene {
+    pub fn lights(&self) -> Lights {
+        Lights::with_sky_map(&self.world(), self.sky_map.as_ref().map(|(map, _)| map.clone()))
     }
 }
 

@@ -1,10 +1,14 @@
 //! Direct light in closed form, seen from a point through a narrow camera.
 
-use glam::DVec3;
+use std::sync::Arc;
+
+use glam::{DVec3, Vec3};
 
 use super::brute::{Scene, frame};
 use super::mean_of;
+use crate::light::SkyMap;
 use crate::material::{Bsdf, Distribution};
+use crate::world::Beam;
 
 const PI: f64 = std::f64::consts::PI;
 
@@ -81,6 +85,86 @@ fn open_sky() {
         let found = mean_of(&scene, &frame, 2048);
         println!("{found}");
         assert!((found / 2.0 - 1.0).abs() < 0.002, "{found}");
+    }
+}
+
+/// Points, spots and parallel light: intensity over squared distance times cosine, exactly, for one light; in the mean for all at once.
+#[test]
+fn beams_over_a_plane() {
+    let p = DVec3::new(0.0, 0.0, 3.0);
+    let position = [1.0, 2.0, 2.5f32];
+    let way = DVec3::from(position.map(f64::from)) - p;
+    let (distance, cos) = (way.length(), way.y / way.length());
+    let towards = (-way / distance).as_vec3();
+    // turned from the middle of the cone by 0.3
+    let axis = (glam::Quat::from_axis_angle(towards.any_orthonormal_vector(), 0.3) * towards).to_array();
+    let intensity = [5.0; 3];
+    let spot = |beam, cutoff| Beam::Spot { position, axis, intensity, beam, cutoff };
+    let direction = Vec3::new(0.6, -0.48, 0.64);
+    let straight = 5.0 * cos / distance.powi(2);
+    let cases = [
+        (Beam::Point { position, intensity }, straight),
+        (spot(0.31, 0.4), straight),
+        (spot(0.1, 0.5), 0.5 * straight),
+        (spot(0.1, 0.29), 0.0),
+        (Beam::Directional { direction: direction.to_array(), irradiance: [3.0; 3] }, 3.0 * 0.48),
+        // from below
+        (Beam::Directional { direction: [0.0, 1.0, 0.0], irradiance: [3.0; 3] }, 0.0),
+    ];
+    let mut all = floor();
+    for (beam, irradiance) in cases {
+        let (mut scene, frame) = floor();
+        scene.beams.push(beam);
+        all.0.beams.push(beam);
+        let found = mean_of(&scene, &frame, 4);
+        let expected = 0.5 / PI * irradiance;
+        assert!((found - expected).abs() <= 2e-4 * expected, "{beam:?}: {found} {expected}");
+    }
+    let (found, expected) = (mean_of(&all.0, &all.1, 4096), 0.5 / PI * cases.iter().map(|c| c.1).sum::<f64>());
+    assert!((found / expected - 1.0).abs() < 0.005, "{found} {expected}");
+    // something in the way, short of the point and beyond it
+    for (height, expected) in [(1.0, 0.0), (2.5, 0.5 / PI * straight)] {
+        let (mut scene, frame) = floor();
+        scene.beams.push(Beam::Point { position, intensity });
+        let black = scene.diffuse(0.0);
+        let lid = scene.shape(black, None);
+        scene.quad(lid, [-0.5, height, 1.5], [2.0, 0.0, 0.0], [0.0, 0.0, 2.0]);
+        let found = mean_of(&scene, &frame, 4);
+        assert!((found - expected).abs() <= 2e-4 * expected, "{height}: {found} {expected}");
+    }
+}
+
+/// A turned picture of the sky over a floor: the irradiance by quadrature of the look-up's plain sum; alone and beside a lamp that lights nothing.
+#[test]
+fn sky_map_over_a_plane() {
+    let (w, h) = (24, 13);
+    let texels: Vec<[f32; 3]> =
+        (0..w * h).map(|i| [if i % 37 == 5 { 40.0 } else { (i % 5) as f32 * 0.25 }; 3]).collect();
+    let map = Arc::new(SkyMap::new(w, h, texels).unwrap());
+    // the picture's axes in the world: x, y, z are z, x, y
+    let to_map = [[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]];
+    let (mut irradiance, n) = (0.0, 800);
+    for i in 0..n {
+        // even in the square of the sine: the cosine is in the measure
+        let s = ((f64::from(i) + 0.5) / f64::from(n)).sqrt();
+        for j in 0..4 * n {
+            let phi = 2.0 * PI * (f64::from(j) + 0.5) / f64::from(4 * n);
+            let d = DVec3::new(s * phi.cos(), (1.0 - s * s).sqrt(), s * phi.sin());
+            irradiance += f64::from(map.radiance(Vec3::new(d.z as f32, d.x as f32, d.y as f32)).x);
+        }
+    }
+    let expected = 0.5 * irradiance / f64::from(4 * n * n);
+    for other in [false, true] {
+        let (mut scene, frame) = floor();
+        scene.sky_map = Some((map.clone(), to_map));
+        if other {
+            let black = scene.diffuse(0.0);
+            let light = scene.shape(black, Some([1.0; 3]));
+            scene.quad(light, [-1.0, -3.0, -1.0], [2.0, 0.0, 0.0], [0.0, 0.0, 2.0]);
+        }
+        let found = mean_of(&scene, &frame, 4096);
+        println!("{found} {expected}");
+        assert!((found / expected - 1.0).abs() < 0.004, "{found} {expected}");
     }
 }
 

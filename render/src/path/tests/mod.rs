@@ -11,12 +11,11 @@ use brute::Scene;
 use super::{Context, reference};
 use crate::film::FilmPart;
 use crate::frame::Frame;
-use crate::light::Lights;
 
 /// Mean of the picture's red; nothing may be rejected.
 fn mean_of(scene: &Scene, frame: &Frame, samples: u32) -> f64 {
     let world = scene.world();
-    let lights = Lights::new(&world);
+    let lights = scene.lights();
     let context = Context { world: &world, lights: &lights, frame };
     let mut film = FilmPart::new(frame.size);
     reference::render(&context, scene, 0..samples, &mut film);

@@ -16,6 +16,7 @@ use crate::path::shade::shade_plain;
 use crate::path::{Context, Outcome, PathRay, ShadowRay, camera_ray, camera_rays, shade};
 use crate::ray::{Hit, PathKey};
 use crate::testing::Rng;
+use crate::world::Beam;
 
 fn channel_means(scene: &Scene, lights: Option<&Lights>, frame: &Frame, samples: u32) -> ([f64; 3], f64) {
     let world = scene.world();
@@ -269,7 +270,7 @@ fn lights_do_not_shadow_themselves() {
         }
         let lights = Lights::new(&scene.world());
         let o = at + rng.vec3([0.02, 2.0, 50.0][i % 3]);
-        let Some(s) = lights.sample(o, rng.u32(), [rng.f32(), rng.f32()]) else { continue };
+        let Some(s) = lights.sample(o, rng.u32(), [rng.u32(), rng.u32()]) else { continue };
         let d = UnitDir::encode(s.d.to_array()).decode();
         let ray = crate::ray::Ray { o: o.to_array(), tmin: 0.0, d, tmax: s.tmax };
         rays += 1;
@@ -324,6 +325,13 @@ fn nothing_is_nan() {
                     scene.normals[n - 1] = Some([rng.vec3(1.0).to_array(), rng.vec3(1e-20).to_array(), [0.0; 3]]);
                 }
             }
+        }
+        if i % 4 == 1 {
+            let (place, intensity) = (sizes[(rng.u32() % 5) as usize], [rng.f32(), 0.0, 1e6]);
+            let (position, axis) = (rng.vec3(place).to_array(), rng.direction().to_array());
+            scene.beams.push(Beam::Point { position, intensity });
+            scene.beams.push(Beam::Spot { position, axis, intensity, beam: 0.5, cutoff: 1.5 });
+            scene.beams.push(Beam::Directional { direction: axis, irradiance: intensity });
         }
         let world = scene.world();
         let lights = Lights::new(&world);

@@ -229,4 +229,6 @@ fn shorten(text: &str) -> String {
 }
 
 #[cfg(test)]
+mod emitter_tests;
+#[cfg(test)]
 mod tests;

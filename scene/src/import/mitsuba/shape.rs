@@ -99,7 +99,7 @@ impl Converter<'_> {
         if radius == 0.0 || lengths.contains(&0.0) {
             return malformed(place, "a sphere of radius 0");
         }
-        if !is_similarity(columns, lengths[0]) {
+        if !is_similarity(to_world) {
             let stand_in = "the sphere whose radius is that along x";
             self.unsupported(place, "sphere under a map that is no similarity (an ellipsoid)", stand_in);
         }
@@ -113,11 +113,14 @@ impl Converter<'_> {
     }
 }
 
-/// Whether three columns are at right angles and equally long, to the precision that files write (1e-4 relative).
-fn is_similarity(columns: [[f64; 3]; 3], length: f64) -> bool {
-    let within = 1e-4 * length * length;
-    (0..3).all(|i| {
-        let j = (i + 1) % 3;
-        dot(columns[i], columns[j]).abs() <= within && (dot(columns[i], columns[i]) - length * length).abs() <= within
-    })
+/// Whether the columns are at right angles and equally long, to the precision that files write (1e-4 relative), and not 0.
+pub(super) fn is_similarity(map: &Affine) -> bool {
+    let columns = [0, 1, 2].map(|c| [0, 1, 2].map(|r| map.0[r][c]));
+    let square = dot(columns[0], columns[0]);
+    let within = 1e-4 * square;
+    square > 0.0
+        && (0..3).all(|i| {
+            let j = (i + 1) % 3;
+            dot(columns[i], columns[j]).abs() <= within && (dot(columns[i], columns[i]) - square).abs() <= within
+        })
 }

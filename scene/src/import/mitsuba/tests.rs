@@ -3,26 +3,26 @@
 use std::path::Path;
 
 use crate::ImportError;
-use crate::description::{Affine, Bsdf, Description, Distribution, Filter, Geometry};
+use crate::description::{Affine, Bsdf, Description, Distribution, Environment, Filter, Geometry};
 use crate::import::tests::{folder, records, write};
 use crate::import::{ImportOptions, import};
 use crate::record::Record;
 
 /// Imports the inside of a `<scene>`, with a sky.
-fn scene(inside: &str) -> Result<Description, ImportError> {
+pub(super) fn scene(inside: &str) -> Result<Description, ImportError> {
     scene_with(inside, &ImportOptions { sky: Some([1.0; 3]), ..ImportOptions::default() })
 }
 
-fn scene_with(inside: &str, options: &ImportOptions) -> Result<Description, ImportError> {
+pub(super) fn scene_with(inside: &str, options: &ImportOptions) -> Result<Description, ImportError> {
     let dir = folder();
     import(&write(&dir, "s.xml", format!("<scene version=\"3.0.0\">\n{inside}\n</scene>")), options)
 }
 
-fn message(inside: &str) -> String {
+pub(super) fn message(inside: &str) -> String {
     scene(inside).unwrap_err().to_string()
 }
 
-const CUBE: &str = "<shape type=\"cube\"/>";
+pub(super) const CUBE: &str = "<shape type=\"cube\"/>";
 
 /// The example of this name, and its path.
 fn example(name: &str) -> Description {
@@ -318,8 +318,8 @@ fn all_that_is_unsupported_is_listed() {
          <shape type=\"hair\"/>\n\
          <shape type=\"cube\"><ref id=\"p\"/><medium name=\"interior\" type=\"homogeneous\"/></shape>\n\
          <shape type=\"cube\"><ref id=\"d\"/>\n<float name=\"wobble\" value=\"1\"/></shape>\n\
-         <emitter type=\"envmap\"/>\n\
-         <emitter type=\"point\"/>\n\
+         <emitter type=\"sunsky\"/>\n\
+         <emitter type=\"projector\"/>\n\
          <wurst/>";
     let Err(ImportError::Unsupported(list)) = scene(text) else { panic!("no list") };
     let got: Vec<(u32, &str)> = list.iter().map(|(p, what)| (p.line, what.as_str())).collect();
@@ -333,8 +333,8 @@ fn all_that_is_unsupported_is_listed() {
             (6, "shape \"hair\""),
             (7, "medium \"homogeneous\" in shape \"cube\""),
             (9, "property \"wobble\" of shape \"cube\""),
-            (10, "emitter \"envmap\""),
-            (11, "emitter \"point\""),
+            (10, "emitter \"sunsky\""),
+            (11, "emitter \"projector\""),
             (12, "element <wurst>"),
         ]
     );
@@ -344,7 +344,7 @@ fn all_that_is_unsupported_is_listed() {
     let options = ImportOptions { substitute: true, ..ImportOptions::default() };
     let out = scene_with(text, &options).unwrap();
     assert_eq!(out.substitutions.len(), 10);
-    assert_eq!(out.environment, Some([1.0; 3]), "the sky that stands in");
+    assert_eq!(out.environment, Some(Environment::Constant([1.0; 3])), "the sky that stands in");
     assert_eq!(out.shapes.len(), 2);
     assert!(out.substitutions.iter().all(|s| s.place.line > 0 && !s.stand_in.is_empty()));
 }
