@@ -23,6 +23,9 @@ pub struct Frame {
     pub rr_depth: u32,
     /// Continuations at the first hit (the paper's N_d); 1 is none.
     pub split: u32,
+    /// Camera rays pass through what emits light, and see no sky (Mitsuba's `hide_emitters`).
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub hide_emitters: bool,
 }
 
 /// Why a frame cannot be rendered.

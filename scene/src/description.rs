@@ -2,6 +2,7 @@
 
 use std::path::PathBuf;
 
+pub use rayherd_render::camera::Projection;
 pub use rayherd_render::filter::Filter;
 pub use rayherd_render::material::{Bsdf, Distribution, Material, Transmittance};
 use serde::{Deserialize, Serialize};
@@ -71,10 +72,12 @@ pub enum Geometry {
         /// Where the file has no normals, smooth ones are computed (unless [`Shape::face_normals`]).
         smooth: bool,
     },
-    /// Triangles given in the description itself (rectangle, cube). Positions in object space.
+    /// Triangles given in the description itself (rectangle, cube, disk, cylinder). Object space.
     Inline {
         /// Vertices.
         positions: Vec<[f64; 3]>,
+        /// Shading normals by vertex; empty if there are none.
+        normals: Vec<[f32; 3]>,
         /// Texture coordinates by vertex; empty if there are none.
         uv: Vec<[f32; 2]>,
         /// Triangles, counter-clockwise from the front.
@@ -105,6 +108,8 @@ pub enum MeshFormat {
     Obj,
     /// STL, ascii or binary.
     Stl,
+    /// Mitsuba's `serialized`: the mesh of this number in the file, from 0.
+    Serialized(u32),
 }
 
 /// One shape: geometry, place, look, light.
@@ -128,13 +133,22 @@ pub struct Shape {
     pub face_normals: bool,
 }
 
-/// A perspective camera in world space.
+/// A camera in world space.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Camera {
     /// Camera to world: the camera looks along +z, +y is up, and +x is to the LEFT of the image (Mitsuba's convention).
     pub to_world: Affine,
-    /// Full field of view along x, degrees, in (0, 180).
-    pub fov_x: f64,
+    /// Pinhole, lens or parallel.
+    pub projection: Projection,
+    /// The film's size in pixels and the part of it that is the picture (x, y, width, height); all of it, in any size, if `None`.
+    pub crop: Option<([u32; 2], [u32; 4])>,
+}
+
+impl Camera {
+    /// A pinhole camera with its full field of view along x, degrees, in (0, 180).
+    pub fn perspective(to_world: Affine, fov_x: f64) -> Camera {
+        Camera { to_world, projection: Projection::Perspective { fov_x }, crop: None }
+    }
 }
 
 /// Light that arrives at a point from one direction only. World space.
@@ -210,6 +224,8 @@ pub struct Description {
     pub max_depth: Option<u32>,
     /// Vertex from which Russian roulette starts, if given.
     pub rr_depth: Option<u32>,
+    /// The camera sees neither what emits light nor the sky; both are seen in reflections.
+    pub hide_emitters: bool,
     /// What was replaced by a stand-in on request, for log and report.
     pub substitutions: Vec<Substitution>,
     /// World-space bounds of all primitives, if importing had to find them (to frame a scene without a camera).

@@ -8,7 +8,7 @@ use std::process::ExitCode;
 use clap::Args;
 use rayherd_api::{RenderJob, RenderJobSpec};
 use rayherd_herd::job::spec::import_options;
-use rayherd_scene::description::{Beam, Bsdf, Description, Environment, Geometry, MeshFormat};
+use rayherd_scene::description::{Beam, Bsdf, Description, Environment, Geometry, MeshFormat, Projection};
 use rayherd_scene::import::{ImportOptions, Survey, import, sky_map};
 
 use super::{print, size};
@@ -86,7 +86,18 @@ fn tell(scene: &str, description: &Description, survey: &Survey) -> String {
     line("lights", lights(description, survey));
     if let Some(camera) = &description.camera {
         let [w, h] = description.size.unwrap_or([0, 0]);
-        line("camera", format!("perspective, {:.3} degrees across, {w}x{h}", camera.fov_x));
+        let kind = match camera.projection {
+            Projection::Perspective { fov_x } => format!("perspective, {fov_x:.3} degrees across"),
+            Projection::ThinLens { fov_x, aperture, focus } => {
+                format!("thin lens of radius {aperture}, sharp at {focus}, {fov_x:.3} degrees across")
+            }
+            Projection::Orthographic => "orthographic".to_owned(),
+        };
+        let part = match camera.crop {
+            Some(([w, h], [x, y, ..])) => format!(" from ({x}, {y}) of {w}x{h}"),
+            None => String::new(),
+        };
+        line("camera", format!("{kind}, {w}x{h}{part}"));
     }
     let total = survey.prepared_bytes();
     line(
@@ -136,7 +147,8 @@ fn geometry(geometry: &Geometry) -> &'static str {
         Geometry::MeshFile { format: MeshFormat::Ply, .. } => "ply",
         Geometry::MeshFile { format: MeshFormat::Obj, .. } => "obj",
         Geometry::MeshFile { format: MeshFormat::Stl, .. } => "stl",
-        Geometry::Inline { .. } => "rectangle or cube",
+        Geometry::MeshFile { format: MeshFormat::Serialized(_), .. } => "serialized",
+        Geometry::Inline { .. } => "rectangle, cube, disk or cylinder",
         Geometry::Sphere { .. } => "sphere",
         Geometry::IsoSurface { .. } => "surface of a volume",
     }

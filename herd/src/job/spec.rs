@@ -2,7 +2,7 @@
 //! cluster, so that both make the same bytes.
 
 use rayherd_api::{CameraSpec, LightSpec, RenderJobSpec, Strategy};
-use rayherd_render::camera::Camera;
+use rayherd_render::camera::{Camera, View};
 use rayherd_render::filter::Filter;
 use rayherd_render::frame::Frame;
 use rayherd_scene::import::{CameraView, ImportOptions, Light};
@@ -79,8 +79,8 @@ pub fn frame(spec: &RenderJobSpec, manifest: &Manifest, camera: Option<&CameraSp
         }
     };
     let size = image.size.map(|s| [s.width(), s.height()]).or(defaults.size).unwrap_or(DEFAULT_SIZE);
-    let camera = Camera::new(&camera.to_world.0, camera.fov_x, size, manifest.offset)
-        .map_err(|e| JobError::Settings(format!("camera: {e}")))?;
+    let view = View { to_world: camera.to_world.0, projection: camera.projection, crop: camera.crop };
+    let camera = Camera::of(&view, size, manifest.offset).map_err(|e| JobError::Settings(format!("camera: {e}")))?;
     let given = |v: Option<i32>| v.map(|n| n as u32);
     let frame = Frame {
         camera,
@@ -90,6 +90,7 @@ pub fn frame(spec: &RenderJobSpec, manifest: &Manifest, camera: Option<&CameraSp
         max_depth: given(sampling.max_depth).or(defaults.max_depth).unwrap_or(DEFAULT_MAX_DEPTH),
         rr_depth: given(sampling.rr_depth).or(defaults.rr_depth).unwrap_or(DEFAULT_RR_DEPTH),
         split: given(sampling.split).unwrap_or(1),
+        hide_emitters: defaults.hide_emitters,
     };
     frame.check()?;
     Ok(frame)

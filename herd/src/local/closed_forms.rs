@@ -48,7 +48,16 @@ fn frame(scene: &PreparedScene) -> Frame {
     let s = 0.5f64.sqrt();
     let to_world = [[1.0, 0.0, 0.0, SEEN[0]], [0.0, s, -s, 3.0], [0.0, s, s, SEEN[2] - 3.0]];
     let camera = Camera::new(&to_world, 0.02, [4, 4], scene.manifest.offset).unwrap();
-    Frame { camera, size: [4, 4], filter: Filter::Box, seed: 3, max_depth: 2, rr_depth: 10, split: 1 }
+    Frame {
+        camera,
+        size: [4, 4],
+        filter: Filter::Box,
+        seed: 3,
+        max_depth: 2,
+        rr_depth: 10,
+        split: 1,
+        hide_emitters: false,
+    }
 }
 
 #[test]

@@ -113,8 +113,16 @@ mod tests {
         let size = [70, 33];
         let camera =
             Camera::new(&[[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]], 40.0, size, [0.0; 3]);
-        let frame =
-            Frame { camera: camera.unwrap(), size, filter: Filter::Box, seed: 1, max_depth: 3, rr_depth: 5, split: 1 };
+        let frame = Frame {
+            camera: camera.unwrap(),
+            size,
+            filter: Filter::Box,
+            seed: 1,
+            max_depth: 3,
+            rr_depth: 5,
+            split: 1,
+            hide_emitters: false,
+        };
         let units: Vec<CameraUnit> = (0..tiles(&frame)).map(|tile| CameraUnit { tile, first: 2, end: 5 }).collect();
         assert_eq!(units.len(), 6);
         let pixels: u32 = (0..6).map(|t| tile_pixels(&frame, t)).sum();

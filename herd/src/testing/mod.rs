@@ -32,7 +32,7 @@ fn sheet(corner: [f64; 3], u: [f64; 3], v: [f64; 3], n: u32) -> Geometry {
             triangles.push([p(i, j), p(i + 1, j + 1), p(i, j + 1)]);
         }
     }
-    Geometry::Inline { positions, triangles, uv: vec![] }
+    Geometry::Inline { positions, normals: vec![], triangles, uv: vec![] }
 }
 
 fn shape(name: &str, geometry: Geometry, material: u32, emission: Option<[f32; 3]>) -> Shape {
@@ -91,6 +91,7 @@ pub fn cornell() -> Description {
         spp: None,
         max_depth: None,
         rr_depth: None,
+        hide_emitters: false,
         substitutions: vec![],
         bounds: None,
         bytes_read: 0,
@@ -162,5 +163,6 @@ pub fn frame(scene: &PreparedScene, size: [u32; 2], split: u32) -> Frame {
     // looks along -z of the world from in front of the box: camera z = -z, x to the left
     let to_world = [[-1.0, 0.0, 0.0, 0.05], [0.0, 1.0, 0.0, -0.1], [0.0, 0.0, -1.0, 3.3]];
     let camera = Camera::new(&to_world, 45.0, size, scene.manifest.offset).unwrap();
-    Frame { camera, size, filter: Filter::Tent { radius: 1.0 }, seed: 7, max_depth: 6, rr_depth: 3, split }
+    let filter = Filter::Tent { radius: 1.0 };
+    Frame { camera, size, filter, seed: 7, max_depth: 6, rr_depth: 3, split, hide_emitters: false }
 }

@@ -41,7 +41,7 @@ pub fn shade_traced<S: Surfaces>(
     for (index, ((ray, traced), hit)) in rays.iter().zip(traced).zip(hits).enumerate() {
         if !hit.is_hit() {
             out.counters.missed += 1;
-            if has_sky {
+            if has_sky && !hidden(context, ray) {
                 let (radiance, pdf) = context.lights.sky(traced.d.into());
                 emit(ray, radiance, pdf, out);
             }
@@ -85,8 +85,10 @@ pub(super) fn shade_plain<S: Surfaces>(
         out.counters.shaded += 1;
         if !hit.is_hit() {
             out.counters.missed += 1;
-            let (radiance, pdf) = context.lights.sky(ray.dir.decode().into());
-            emit(ray, radiance, pdf, out);
+            if !hidden(context, ray) {
+                let (radiance, pdf) = context.lights.sky(ray.dir.decode().into());
+                emit(ray, radiance, pdf, out);
+            }
             continue;
         }
         let Some(leaving) = arrive(context, surfaces, index, ray, hit, out) else { continue };
@@ -142,6 +144,10 @@ fn arrive<'a, S: Surfaces>(
     let (frame, world) = (context.frame, context.world);
     let shape = &world.shapes[surfaces.shape(index, hit) as usize];
     if let Some(emission) = shape.emission {
+        if hidden(context, ray) {
+            pass_through(surfaces, index, ray, hit, out);
+            return None;
+        }
         emit_surface(context, surfaces, index, ray, hit, emission.into(), out);
     }
     let number = u32::from(ray.key.vertex) + 1;
@@ -157,6 +163,26 @@ fn arrive<'a, S: Surfaces>(
         return Some(Leaving { material, children: frame.split, throughput: share });
     }
     Some(Leaving { material, children: 1, throughput })
+}
+
+/// Whether a ray is the camera's and must not see what emits light.
+#[inline(always)]
+fn hidden(context: &Context, ray: &PathRay) -> bool {
+    context.frame.hide_emitters && ray.key.vertex == 0
+}
+
+/// The same ray from beyond what it hit; none if the surface is seen edge on.
+#[cold]
+fn pass_through<S: Surfaces>(surfaces: &S, index: usize, ray: &PathRay, hit: &Hit, out: &mut Outcome) {
+    let (o, d) = (Vec3::from(ray.o), Vec3::from(ray.dir.decode()));
+    match Interaction::new(o, d, hit, &surfaces.surface(index, hit)) {
+        Some(at) => {
+            let beyond = PathRay { o: at.origin_beyond().to_array(), ..*ray };
+            out.next.push(beyond);
+            out.next_rays.push(beyond.ray());
+        }
+        None => out.counters.absorbed += 1,
+    }
 }
 
 #[inline(never)]

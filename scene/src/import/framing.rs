@@ -73,12 +73,13 @@ pub(super) fn frame(bounds: [[f64; 3]; 2], up: Up, size: [u32; 2]) -> Option<Fra
         Some(Light { origin, target: center, size: [radius; 2], radiance: [radiance; 3] })
     };
     let lights = [light([-1.0, 0.9, 0.35], 20.0)?, light([1.0, 0.3, 0.5], 3.0)?];
-    Some(Frame { camera: Camera { to_world, fov_x }, lights })
+    Some(Frame { camera: Camera::perspective(to_world, fov_x), lights })
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::description::Projection;
     use crate::import::vector::sub;
 
     #[test]
@@ -94,7 +95,8 @@ mod tests {
             ] {
                 let Frame { camera, lights } = frame(bounds, up, size).unwrap();
                 let column = |c: usize| [0, 1, 2].map(|r| camera.to_world.0[r][c]);
-                let tan_x = libm::tan(camera.fov_x.to_radians() / 2.0);
+                let Projection::Perspective { fov_x } = camera.projection else { panic!("no pinhole") };
+                let tan_x = libm::tan(fov_x.to_radians() / 2.0);
                 let tan_y = tan_x * f64::from(size[1]) / f64::from(size[0]);
                 // how far from the middle of the view, 1 at its border
                 let aside = |p: [f64; 3]| {

@@ -14,6 +14,7 @@ mod options;
 mod placement;
 mod ply;
 mod refraction;
+mod serialized;
 mod shapes;
 mod sky;
 mod source;

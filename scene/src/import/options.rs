@@ -75,7 +75,7 @@ impl CameraView {
             )));
         }
         match look_at(self.origin, self.target, self.up) {
-            Some(to_world) => Ok(Camera { to_world, fov_x: self.fov }),
+            Some(to_world) => Ok(Camera::perspective(to_world, self.fov)),
             None if self.origin == self.target => {
                 Err(OptionError("the camera's origin and target are one point".into()))
             }
@@ -199,12 +199,13 @@ fn numbers(text: &str, form: &str) -> Result<Vec<f64>, OptionError> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::description::Projection;
 
     #[test]
     fn a_camera_is_ten_numbers() {
         let view: CameraView = "0,0,4, 0,0,0, 0,1,0, 40".parse().unwrap();
         let camera = view.camera().unwrap();
-        assert_eq!(camera.fov_x, 40.0);
+        assert_eq!(camera.projection, Projection::Perspective { fov_x: 40.0 });
         assert_eq!(camera.to_world.vector([0.0, 0.0, 1.0]), [0.0, 0.0, -1.0]);
         for (text, what) in [
             ("1,2,3", "3 numbers"),

@@ -4,7 +4,7 @@ use std::fs::File;
 use std::io::{self, Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
 
-use flate2::read::MultiGzDecoder;
+use flate2::read::{MultiGzDecoder, ZlibDecoder};
 
 use crate::ImportError;
 use crate::description::Place;
@@ -35,6 +35,8 @@ pub(super) struct Source {
 enum Input {
     Plain(Counting),
     Gzip(Box<MultiGzDecoder<Counting>>),
+    /// From this byte of the file on.
+    Zlib(Box<ZlibDecoder<Counting>>, u64),
 }
 
 /// A file that counts what is read.
@@ -75,12 +77,23 @@ impl Source {
         })
     }
 
+    /// Opens the zlib data that begin at a byte of a regular file.
+    pub fn open_zlib(path: &Path, at: u64) -> Result<Source, ImportError> {
+        let mut source = Source::open(path)?;
+        let io = |source| ImportError::Io { path: path.into(), source };
+        let mut file = File::open(path).map_err(io)?;
+        file.seek(SeekFrom::Start(at)).map_err(io)?;
+        source.input = Input::Zlib(Box::new(ZlibDecoder::new(Counting(file, 0))), at);
+        Ok(source)
+    }
+
     /// Bytes read from disk, packed ones for gzip.
     pub fn bytes_read(&self) -> u64 {
         self.earlier
             + match &self.input {
                 Input::Plain(file) => file.1,
                 Input::Gzip(decoder) => decoder.get_ref().1,
+                Input::Zlib(decoder, _) => decoder.get_ref().1,
             }
     }
 
@@ -106,7 +119,10 @@ impl Source {
 
     /// Goes to an offset, and the line that it is in; a second pass over (part of) the file.
     pub fn seek(&mut self, offset: u64, line: u32) -> Result<(), ImportError> {
-        let mut fresh = Source::open(&self.path)?;
+        let mut fresh = match self.input {
+            Input::Zlib(_, at) => Source::open_zlib(&self.path, at)?,
+            _ => Source::open(&self.path)?,
+        };
         fresh.earlier = self.bytes_read();
         match &mut fresh.input {
             Input::Plain(file) => {
@@ -114,7 +130,7 @@ impl Source {
                 file.0.seek(SeekFrom::Start(offset)).map_err(io)?;
                 fresh.offset = offset;
             }
-            Input::Gzip(_) => fresh.skip(offset)?,
+            Input::Gzip(_) | Input::Zlib(..) => fresh.skip(offset)?,
         }
         fresh.line = line;
         *self = fresh;
@@ -157,14 +173,15 @@ impl Source {
             let result = match &mut self.input {
                 Input::Plain(file) => file.read(room),
                 Input::Gzip(decoder) => decoder.read(room),
+                Input::Zlib(decoder, _) => decoder.read(room),
             };
             match result {
                 Ok(0) => break,
                 Ok(k) => self.end += k,
                 Err(e) if e.kind() == io::ErrorKind::Interrupted => {}
                 // an error of the disk has a number, one of the packed data has none
-                Err(e) if matches!(self.input, Input::Gzip(_)) && e.raw_os_error().is_none() => {
-                    return self.fail_byte(format!("the gzip data is cut off or broken ({e}): get the file again"));
+                Err(e) if !matches!(self.input, Input::Plain(_)) && e.raw_os_error().is_none() => {
+                    return self.fail_byte(format!("the packed data is cut off or broken ({e}): get the file again"));
                 }
                 Err(e) => return Err(ImportError::Io { path: self.path.clone(), source: e }),
             }

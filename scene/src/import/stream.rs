@@ -9,6 +9,7 @@ use super::mesh::{MeshOptions, MeshStream};
 use super::obj::ObjReader;
 use super::placement::Placement;
 use super::ply::PlyReader;
+use super::serialized::SerializedReader;
 use super::stl::StlReader;
 use crate::ImportError;
 use crate::description::{Description, Geometry, MeshFormat, Shape};
@@ -77,8 +78,8 @@ impl<'a> DescriptionSource<'a> {
         let number = number as u32;
         let placement = Placement::new(shape, number);
         Ok(match &shape.geometry {
-            Geometry::Inline { positions, uv, triangles } => {
-                Box::new(InlineStream { placement, positions, uv, triangles: triangles.iter() })
+            Geometry::Inline { positions, normals, uv, triangles } => {
+                Box::new(InlineStream { placement, positions, normals, uv, triangles: triangles.iter() })
             }
             Geometry::Sphere { center, radius } => Box::new(Once(Some(sphere(shape, number, *center, *radius)))),
             Geometry::MeshFile { path, format, flip_v, smooth } => {
@@ -86,6 +87,11 @@ impl<'a> DescriptionSource<'a> {
                 match format {
                     MeshFormat::Ply => Box::new(MeshStream::new(PlyReader::open(path, &self.options)?, options)?),
                     MeshFormat::Obj => Box::new(MeshStream::new(ObjReader::open(path, &self.options)?, options)?),
+                    MeshFormat::Serialized(index) => {
+                        let reader = SerializedReader::open(path, *index, &self.options)?;
+                        let options = MeshOptions { smooth: *smooth && !reader.face_normals(), ..options };
+                        Box::new(MeshStream::new(reader, options)?)
+                    }
                     MeshFormat::Stl => {
                         // a format without vertices that triangles share has nothing to smooth
                         let options = MeshOptions { smooth: false, ..options };
@@ -171,6 +177,7 @@ impl RecordStream for Once {
 struct InlineStream<'a> {
     placement: Placement,
     positions: &'a [[f64; 3]],
+    normals: &'a [[f32; 3]],
     uv: &'a [[f32; 2]],
     triangles: std::slice::Iter<'a, [u32; 3]>,
 }
@@ -180,8 +187,9 @@ impl RecordStream for InlineStream<'_> {
         let before = out.len();
         for triangle in self.triangles.by_ref().take(max) {
             let p = triangle.map(|i| self.positions[i as usize]);
+            let n = (!self.normals.is_empty()).then(|| triangle.map(|i| self.normals[i as usize]));
             let uv = (!self.uv.is_empty()).then(|| triangle.map(|i| self.uv[i as usize]));
-            out.push(self.placement.triangle(p, None, uv));
+            out.push(self.placement.triangle(p, n, uv));
         }
         Ok(out.len() - before)
     }

@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use super::*;
-use crate::description::{Affine, Geometry, Shape};
+use crate::description::{Affine, Geometry, Projection, Shape};
 use crate::record::{Record, RecordSource, TriangleRecord};
 
 /// A folder that vanishes.
@@ -98,7 +98,7 @@ fn a_bare_mesh_is_framed_and_lit() {
     assert_eq!(out.shapes.len(), 2);
     assert_eq!(out.environment, None);
     assert_eq!(out.size, Some([20, 10]));
-    assert_eq!(out.camera.unwrap().fov_x, 40.0);
+    assert_eq!(out.camera.unwrap().projection, Projection::Perspective { fov_x: 40.0 });
     assert_eq!(out.materials[0].bsdf, Bsdf::Diffuse { reflectance: [0.1, 0.2, 0.3] });
 }
 

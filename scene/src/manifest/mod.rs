@@ -118,6 +118,8 @@ pub struct Defaults {
     pub max_depth: Option<u32>,
     /// As in [`Description::rr_depth`].
     pub rr_depth: Option<u32>,
+    /// As in [`Description::hide_emitters`].
+    pub hide_emitters: bool,
     /// Stand-ins that were made on request.
     pub substitutions: Vec<Substitution>,
 }
@@ -132,6 +134,7 @@ impl Defaults {
             spp: description.spp,
             max_depth: description.max_depth,
             rr_depth: description.rr_depth,
+            hide_emitters: description.hide_emitters,
             substitutions: description.substitutions.clone(),
         }
     }

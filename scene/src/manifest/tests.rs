@@ -58,7 +58,7 @@ pub(crate) fn sample() -> Manifest {
             rewritten_bytes: 200,
         },
         defaults: Defaults {
-            camera: Some(Camera { to_world: Affine::IDENTITY, fov_x: 39.3 }),
+            camera: Some(Camera::perspective(Affine::IDENTITY, 39.3)),
             filter: Some(Filter::Gaussian { stddev: 0.5 }),
             ..Default::default()
         },

@@ -23,6 +23,7 @@ fn frame() -> Frame {
         max_depth: 20,
         rr_depth: 5,
         split: 1,
+        hide_emitters: false,
     }
 }
 

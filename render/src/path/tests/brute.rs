@@ -189,5 +189,6 @@ pub fn frame(eye: [f64; 3], fov: f64, size: [u32; 2], max_depth: u32) -> Frame {
         max_depth,
         rr_depth: 1000,
         split: 1,
+        hide_emitters: false,
     }
 }

@@ -66,6 +66,7 @@ pub fn frame(size: u32) -> Frame {
         max_depth: 8,
         rr_depth: 5,
         split: 1,
+        hide_emitters: false,
     }
 }
 

@@ -168,6 +168,34 @@ fn sky_map_over_a_plane() {
     }
 }
 
+/// Emitters that are hidden: the camera sees the floor behind a lamp and no sky, and the lamp still lights the floor; a mirror shows it.
+#[test]
+fn hidden_emitters() {
+    let (mut scene, mut frame) = floor();
+    let black = scene.diffuse(0.0);
+    let light = scene.shape(black, Some([3.0; 3]));
+    let (center, r) = ([0.0, 2.0, 3.0f32], 0.7f32);
+    scene.sphere(light, center, r, false);
+    // in the way, darker than the floor and lighting nothing: it faces the camera
+    let dim = scene.shape(black, Some([1e-3; 3]));
+    scene.quad(dim, [-0.1, 1.4, 1.5], [0.0, 0.1, 0.1], [0.2, 0.0, 0.0]);
+    let irradiance = PI * 3.0 * (f64::from(r) / 2.0).powi(2);
+    assert!((mean_of(&scene, &frame, 16) / 1e-3 - 1.0).abs() < 1e-5, "seen when it is not hidden");
+    frame.hide_emitters = true;
+    let found = mean_of(&scene, &frame, 2048);
+    assert!((found / (0.5 / PI * irradiance) - 1.0).abs() < 0.004, "{found}");
+    // the sky: hidden from the camera, not from a mirror
+    let up = super::brute::frame([0.0; 3], 20.0, [4, 4], 3);
+    let hidden = crate::frame::Frame { hide_emitters: true, ..up.clone() };
+    let mut scene = Scene { environment: Some([2.0; 3]), ..Scene::default() };
+    assert_eq!((mean_of(&scene, &up, 4), mean_of(&scene, &hidden, 4)), (2.0, 0.0));
+    let mirror = scene.material(Bsdf::Conductor { eta: [0.0; 3], k: [1.0; 3], specular: [1.0; 3] }, true);
+    let shape = scene.shape(mirror, None);
+    scene.quad(shape, [-9.0, -9.0, 4.0], [0.0, 18.0, 0.0], [18.0, 0.0, 0.0]);
+    let found = mean_of(&scene, &hidden, 4);
+    assert!((found - 2.0).abs() < 1e-5, "{found}");
+}
+
 /// A convex metal body under an even sky: a mirror shows the sky times its reflectance, a rough one less by its microfacets' shadows.
 #[test]
 fn metal_under_the_sky() {

@@ -231,4 +231,8 @@ fn shorten(text: &str) -> String {
 #[cfg(test)]
 mod emitter_tests;
 #[cfg(test)]
+mod sensor_tests;
+#[cfg(test)]
+mod shape_tests;
+#[cfg(test)]
 mod tests;

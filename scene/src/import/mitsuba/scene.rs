@@ -92,9 +92,7 @@ impl Converter<'_> {
             }
         }
         self.ignore(id, &["strict_normals", "samples_per_pass", "block_size", "timeout"]);
-        if self.boolean(id, "hide_emitters")? == Some(true) {
-            self.unsupported(place, "hide_emitters", "visible emitters");
-        }
+        self.out.hide_emitters = self.boolean(id, "hide_emitters")?.unwrap_or(false);
         self.leave(id);
         Ok(())
     }

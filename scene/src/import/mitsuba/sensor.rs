@@ -3,7 +3,10 @@
 use super::Converter;
 use super::xml::{ObjectId, malformed};
 use crate::ImportError;
-use crate::description::{Camera, Filter, Place};
+use crate::description::{Camera, Filter, Place, Projection};
+
+/// A film's size, and the part of it that is the picture: x, y, width, height.
+type Crop = ([u32; 2], [u32; 4]);
 
 /// Largest width or height of a film.
 const MAX_SIDE: i64 = 1 << 16;
@@ -15,8 +18,9 @@ impl Converter<'_> {
         // Mitsuba's film where none is given
         self.out.size = Some([768, 576]);
         self.out.filter = Some(Filter::Gaussian { stddev: 0.5 });
+        let mut crop = None;
         for (_, film) in self.nested(id, "film")? {
-            self.film(film)?;
+            crop = self.film(film)?;
         }
         for (_, sampler) in self.nested(id, "sampler")? {
             if let Some(n) = self.integer(sampler, "sample_count")? {
@@ -31,24 +35,25 @@ impl Converter<'_> {
         if self.options.size.is_some() {
             self.out.size = self.options.size;
         }
-        match object.plugin.as_str() {
-            "perspective" => {}
-            "thinlens" => {
-                self.ignore(id, &["aperture_radius", "focus_distance"]);
-                self.unsupported(place, "sensor \"thinlens\"", "the pinhole camera of the same view");
-            }
+        // a field of view is that of the whole film
+        let film = crop.map_or(self.out.size.unwrap_or([1, 1]), |(film, _)| film);
+        let aspect = f64::from(film[0]) / f64::from(film[1]);
+        let projection = match object.plugin.as_str() {
+            "perspective" => Projection::Perspective { fov_x: self.fov_x(id, aspect, place)? },
+            "thinlens" => self.thin_lens(id, aspect)?,
+            "orthographic" => Projection::Orthographic,
             plugin => {
+                let fov_x = self.fov_x(id, aspect, place)?;
                 self.unsupported(place, format!("sensor \"{plugin}\""), "a perspective camera of the same place");
                 object.properties.iter().for_each(|p| p.used.set(true));
+                Projection::Perspective { fov_x }
             }
-        }
-        let size = self.out.size.unwrap_or([1, 1]);
-        let fov_x = self.fov_x(id, f64::from(size[0]) / f64::from(size[1]), place)?;
+        };
         let to_world = self.transform(id, "to_world")?;
         if to_world.determinant() == 0.0 || !to_world.determinant().is_finite() {
             return malformed(place, "the sensor's to_world is singular");
         }
-        self.out.camera = Some(Camera { to_world, fov_x });
+        self.out.camera = Some(Camera { to_world, projection, crop });
         self.ignore(id, &["near_clip", "far_clip", "focus_distance", "shutter_open", "shutter_close"]);
         for name in ["principal_point_offset_x", "principal_point_offset_y"] {
             if self.float(id, name)?.is_some_and(|v| v != 0.0) {
@@ -57,6 +62,26 @@ impl Converter<'_> {
         }
         self.leave(id);
         Ok(())
+    }
+
+    fn thin_lens(&mut self, id: ObjectId, aspect: f64) -> Result<Projection, ImportError> {
+        let place = &self.document.objects[id].place;
+        let fov_x = self.fov_x(id, aspect, place)?;
+        let Some(aperture) = self.float(id, "aperture_radius")? else {
+            return malformed(place, "a thinlens without an aperture_radius");
+        };
+        // where Mitsuba's far clip plane is, when nothing is said
+        let focus = match self.float(id, "focus_distance")? {
+            Some(focus) => focus,
+            None => self.float(id, "far_clip")?.unwrap_or(1e4),
+        };
+        if !(aperture >= 0.0 && focus > 0.0) {
+            return malformed(
+                place,
+                format!("aperture_radius {aperture} and focus_distance {focus}: they should be at least 0 and above 0"),
+            );
+        }
+        Ok(Projection::ThinLens { fov_x, aperture, focus })
     }
 
     /// Mitsuba's `parse_fov` (src/render/sensor.cpp): the full angle along x in degrees.
@@ -92,7 +117,8 @@ impl Converter<'_> {
         Ok(2.0 * libm::atan(along_x).to_degrees())
     }
 
-    fn film(&mut self, id: ObjectId) -> Result<(), ImportError> {
+    /// Size and filter of the film; what of it is the picture, if that is not all.
+    fn film(&mut self, id: ObjectId) -> Result<Option<Crop>, ImportError> {
         let object = &self.document.objects[id];
         let place = &object.place;
         let mut size = [768, 576];
@@ -104,15 +130,24 @@ impl Converter<'_> {
                 *slot = n as u32;
             }
         }
-        self.out.size = Some(size);
-        let crop = |name: &str, whole: i64| Ok::<bool, ImportError>(self.integer(id, name)?.is_none_or(|n| n == whole));
-        let whole = crop("crop_width", size[0].into())?
-            & crop("crop_height", size[1].into())?
-            & crop("crop_offset_x", 0)?
-            & crop("crop_offset_y", 0)?;
-        if !whole {
-            self.unsupported(place, "crop window of the film", "the whole film");
+        let get = |name: &str, default: u32| self.integer(id, name).map(|n| n.unwrap_or(default.into()));
+        let (x, y) = (get("crop_offset_x", 0)?, get("crop_offset_y", 0)?);
+        let (width, height) = (get("crop_width", size[0])?, get("crop_height", size[1])?);
+        let inside = |at: i64, length: i64, all: u32| {
+            (0..i64::from(all)).contains(&at) && (1..=i64::from(all) - at).contains(&length)
+        };
+        if !(inside(x, width, size[0]) && inside(y, height, size[1])) {
+            return malformed(
+                place,
+                format!(
+                    "the crop of {width} x {height} at ({x}, {y}) should lie on the film of {} x {}",
+                    size[0], size[1]
+                ),
+            );
         }
+        let part = [x, y, width, height].map(|n| n as u32);
+        self.out.size = Some([part[2], part[3]]);
+        let crop = (part != [0, 0, size[0], size[1]]).then_some((size, part));
         for (_, filter) in self.nested(id, "rfilter")? {
             self.out.filter = Some(self.filter(filter)?);
         }
@@ -139,7 +174,7 @@ impl Converter<'_> {
             ],
         );
         self.leave(id);
-        Ok(())
+        Ok(crop)
     }
 
     fn filter(&mut self, id: ObjectId) -> Result<Filter, ImportError> {

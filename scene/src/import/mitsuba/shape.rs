@@ -1,4 +1,4 @@
-//! Shapes: mesh files, rectangle, cube, sphere.
+//! Shapes: mesh files, rectangle, cube, disk, cylinder, sphere; groups and their instances.
 
 use super::Converter;
 use super::xml::{ObjectId, malformed};
@@ -7,12 +7,35 @@ use crate::description::{Affine, Geometry, MeshFormat, Place, Shape};
 use crate::import::shapes;
 use crate::import::vector::dot;
 
+/// Most shapes of a scene, those of instances counted one by one.
+const MAX_SHAPES: usize = 1 << 20;
+
 impl Converter<'_> {
+    /// A shape of the scene. What a `shapegroup` holds is where its instances put it.
     pub(super) fn shape(&mut self, id: ObjectId, from: &Place) -> Result<(), ImportError> {
-        self.enter(id, from)?;
+        self.shape_under(id, from, &Affine::IDENTITY)
+    }
+
+    /// A shape under the map of the instance that it belongs to.
+    fn shape_under(&mut self, id: ObjectId, from: &Place, outer: &Affine) -> Result<(), ImportError> {
         let object = &self.document.objects[id];
+        match object.plugin.as_str() {
+            "instance" => return self.instance(id, from, outer),
+            "shapegroup" => {
+                object.properties.iter().for_each(|p| p.used.set(true));
+                return Ok(());
+            }
+            _ => {}
+        }
+        self.enter(id, from)?;
         let place = &object.place;
-        let mut to_world = self.transform(id, "to_world")?;
+        let mut to_world = outer.after(&self.transform(id, "to_world")?);
+        if self.out.shapes.len() >= MAX_SHAPES {
+            let message = format!(
+                "more than {MAX_SHAPES} shapes, instances counted one by one: this is no scene that can be read"
+            );
+            return Err(ImportError::Limit { path: place.file.clone(), message });
+        }
         if !to_world.determinant().is_finite() {
             return malformed(place, "to_world is too large for floating point");
         }
@@ -21,6 +44,18 @@ impl Converter<'_> {
         let geometry = match object.plugin.as_str() {
             "rectangle" => Some(shapes::rectangle()),
             "cube" => Some(shapes::cube()),
+            "disk" => Some(shapes::disk()),
+            "cylinder" => {
+                to_world = self.cylinder(id, &to_world)?;
+                Some(shapes::cylinder())
+            }
+            "serialized" => {
+                let index = self.integer(id, "shape_index")?.unwrap_or(0);
+                let Ok(index) = u32::try_from(index) else {
+                    return malformed(place, format!("shape_index {index} should be at least 0"));
+                };
+                self.mesh(id, MeshFormat::Serialized(index), false)?
+            }
             "sphere" => Some(self.sphere(id, &mut to_world, &mut flip)?),
             "ply" => self.mesh(id, MeshFormat::Ply, false)?,
             "obj" => self.mesh(id, MeshFormat::Obj, true)?,
@@ -73,6 +108,39 @@ impl Converter<'_> {
         Ok(())
     }
 
+    /// The shapes of a group under a map. Mitsuba keeps one copy of a group for all its instances; here each is laid out.
+    fn instance(&mut self, id: ObjectId, from: &Place, outer: &Affine) -> Result<(), ImportError> {
+        self.enter(id, from)?;
+        let place = &self.document.objects[id].place;
+        let to_world = outer.after(&self.transform(id, "to_world")?);
+        let groups = self.nested(id, "shape")?;
+        let [(at, group)] = groups[..] else {
+            return malformed(place, "an instance needs one shapegroup inside, or a ref to one");
+        };
+        if self.document.objects[group].plugin != "shapegroup" {
+            return malformed(&at.place, "what an instance refers to should be a shapegroup");
+        }
+        self.enter(group, &at.place)?;
+        for (p, shape) in self.nested(group, "shape")? {
+            self.shape_under(shape, &p.place, &to_world)?;
+        }
+        self.leave(group);
+        self.leave(id);
+        Ok(())
+    }
+
+    /// The map from the cylinder of radius 1 and height 1 to the one that an object describes.
+    fn cylinder(&mut self, id: ObjectId, to_world: &Affine) -> Result<Affine, ImportError> {
+        let place = &self.document.objects[id].place;
+        let p0 = self.point(id, "p0")?.unwrap_or([0.0; 3]);
+        let p1 = self.point(id, "p1")?.unwrap_or([0.0, 0.0, 1.0]);
+        let radius = self.float(id, "radius")?.unwrap_or(1.0);
+        match shapes::between(p0, p1, radius) {
+            Some(map) => Ok(to_world.after(&map)),
+            None => malformed(place, "a cylinder needs two different points and a radius above 0"),
+        }
+    }
+
     fn mesh(&mut self, id: ObjectId, format: MeshFormat, flip_v: bool) -> Result<Option<Geometry>, ImportError> {
         let object = &self.document.objects[id];
         let Some((name, place)) = self.string(id, "filename")? else {
@@ -82,6 +150,9 @@ impl Converter<'_> {
         let flip_v = self.boolean(id, "flip_tex_coords")?.unwrap_or(flip_v);
         // 0.6: normals above this crease angle are split; without it its default is to use what the file has
         for name in ["max_smooth_angle", "shape_index"] {
+            if matches!(format, MeshFormat::Serialized(_)) && name == "shape_index" {
+                continue;
+            }
             if let Some(p) = self.property(id, name) {
                 self.unsupported(&p.place, format!("property \"{name}\" of shape \"{}\"", object.plugin), "nothing");
             }
