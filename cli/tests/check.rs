@@ -49,3 +49,39 @@ fn all_problems_are_named() {
     let run = rayherd(folder.path(), &["check", "t.xml"]);
     assert!(run.code == 2 && run.err.contains("t.xml:3") && run.err.contains("gone.ply"), "{}", run.err);
 }
+
+/// Textures that are missing, no images, or cut off: all at once, by file and line; nothing is rendered without them.
+#[test]
+fn bad_textures_are_named_together() {
+    let folder = tempfile::tempdir().unwrap();
+    let shape = |name: &str| {
+        format!(
+            "<shape type='rectangle'><bsdf type='diffuse'><texture type='bitmap' name='reflectance'>\
+             <string name='filename' value='{name}'/></texture></bsdf></shape>\n"
+        )
+    };
+    let text = format!(
+        "<scene version='3.0.0'>\n{}{}{}{}<emitter type='constant'/></scene>",
+        shape("gone.png"),
+        shape("text.jpg"),
+        shape("cut.hdr"),
+        shape("good.hdr")
+    );
+    fs::write(folder.path().join("s.xml"), text).unwrap();
+    fs::write(folder.path().join("text.jpg"), "a text").unwrap();
+    let head = "#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 2 +X 1\n";
+    fs::write(folder.path().join("cut.hdr"), format!("{head}abcd")).unwrap();
+    fs::write(folder.path().join("good.hdr"), format!("{head}abcdefgh")).unwrap();
+    let run = rayherd(folder.path(), &["check", "s.xml"]);
+    assert_eq!(run.code, 2, "{}", run.err);
+    for part in
+        ["s.xml:2: texture file \"gone.png\"", "s.xml:3: texture file \"text.jpg\"", "s.xml:4", "cut.hdr", "3 problems"]
+    {
+        assert!(run.err.contains(part), "no {part:?} in {}", run.err);
+    }
+    assert!(run.out.contains("textures     2: 2 image; 24 B of texels"), "{}", run.out);
+    let run = rayherd(folder.path(), &["render", "s.xml"]);
+    assert!(run.code == 2 && run.err.contains("gone.png") && run.err.contains("text.jpg"), "{}", run.err);
+    let run = rayherd(folder.path(), &["render", "s.xml", "--substitute"]);
+    assert!(run.code == 2 && run.err.contains("cut.hdr") && run.err.contains("s.xml:4"), "{}", run.err);
+}

@@ -14,5 +14,6 @@ pub mod store;
 pub mod task;
 #[cfg(test)]
 mod testing;
+pub mod textures;
 pub mod wave;
 pub mod wire;

@@ -136,6 +136,8 @@ pub struct NodeReport {
     pub remote_reads: u64,
     /// The most bytes of scene data that it held in memory at once.
     pub peak_scene_bytes: u64,
+    /// The most bytes of texture tiles that it held in memory at once.
+    pub peak_texture_bytes: u64,
 }
 
 /// Everything a run says about itself.

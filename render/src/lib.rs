@@ -20,4 +20,5 @@ pub mod ray;
 pub mod sampler;
 #[cfg(test)]
 mod testing;
+pub mod texture;
 pub mod world;

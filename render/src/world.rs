@@ -1,15 +1,19 @@
-//! The small, global part of a prepared scene: materials, shapes, lights. Every task holds it.
+//! The small, global part of a prepared scene: materials, textures, shapes, lights. Every task holds it.
 
 use serde::{Deserialize, Serialize};
 
 use crate::material::Material;
 use crate::ray::PrimId;
+use crate::texture::{Bitmap, Texture};
 
-/// Materials, shapes, emitters and sky of a scene, in recentred f32 coordinates.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+/// Materials, textures, shapes, emitters and sky of a scene, in recentred f32 coordinates.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct World {
     /// What shapes refer to.
     pub materials: Vec<Material>,
+    /// What materials refer to; the tiles of all, in this order, are numbered from 0.
+    #[serde(default)]
+    pub textures: Vec<Texture>,
     /// By shape number, as the attributes of a split name them.
     pub shapes: Vec<ShapeInfo>,
     /// Every primitive that emits, by ascending id.
@@ -22,6 +26,43 @@ pub struct World {
     pub lo: [f32; 3],
     /// Upper corner of the scene's box.
     pub hi: [f32; 3],
+}
+
+impl World {
+    /// Number of tiles of all textures.
+    pub fn tiles(&self) -> u32 {
+        self.textures.iter().map(|t| t.tiles().end).max().unwrap_or(0)
+    }
+
+    /// Checks that every number names something that is there, and that textures are what look-ups rely on; the message says what is wrong.
+    pub fn check(&self) -> Result<(), String> {
+        let mut next = 0;
+        for (i, texture) in self.textures.iter().enumerate() {
+            let Texture::Bitmap(bitmap) = texture else { continue };
+            let sound = bitmap.size.iter().all(|n| (1..=Bitmap::MOST).contains(n))
+                && [1, 3].contains(&bitmap.channels)
+                && bitmap.first_tile == next
+                && bitmap.tiles().end < 1 << 28;
+            if !sound {
+                return Err(format!("texture {i} has a size, channels or tiles that cannot be"));
+            }
+            next = bitmap.tiles().end;
+        }
+        let (materials, textures) = (self.materials.len(), self.textures.len());
+        for material in &self.materials {
+            let Some(detail) = &material.detail else { continue };
+            let back = detail.back.is_none_or(|m| (m as usize) < materials);
+            if !back || detail.textures().any(|t| t as usize >= textures) {
+                return Err(format!("material {:?} names a texture or material that it lacks", material.name));
+            }
+        }
+        if self.shapes.iter().any(|s| s.material as usize >= materials)
+            || self.emissive.iter().any(|e| e.shape as usize >= self.shapes.len())
+        {
+            return Err("it names shapes or materials that it lacks".into());
+        }
+        Ok(())
+    }
 }
 
 /// Light from infinitely far away.

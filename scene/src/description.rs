@@ -4,7 +4,10 @@ use std::path::PathBuf;
 
 pub use rayherd_render::camera::Projection;
 pub use rayherd_render::filter::Filter;
-pub use rayherd_render::material::{Bsdf, Distribution, Material, Transmittance};
+pub use rayherd_render::material::{
+    Amount, Bsdf, Detail, Distribution, Material, Relief, ReliefKind, Slot, Textured, Transmittance,
+};
+pub use rayherd_render::texture::{Checkerboard, Filter as TexelFilter, UvMap, Wrap};
 use serde::{Deserialize, Serialize};
 
 /// Where in a source file something stands, for messages.
@@ -133,6 +136,35 @@ pub struct Shape {
     pub face_normals: bool,
 }
 
+/// A texture.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Texture {
+    /// Where the source defines it.
+    pub place: Place,
+    /// What it is.
+    pub kind: TextureKind,
+}
+
+/// Kinds of textures.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub enum TextureKind {
+    /// An image file.
+    Image {
+        /// The file.
+        path: PathBuf,
+        /// Its bytes are numbers as they are, not sRGB.
+        raw: bool,
+        /// Beyond the image.
+        wrap: Wrap,
+        /// Between texels.
+        filter: TexelFilter,
+        /// Texture coordinates to those of the image.
+        to_uv: UvMap,
+    },
+    /// Squares of two colours.
+    Checkerboard(Checkerboard),
+}
+
 /// A camera in world space.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Camera {
@@ -208,6 +240,8 @@ pub struct Description {
     pub shapes: Vec<Shape>,
     /// What shapes refer to.
     pub materials: Vec<Material>,
+    /// What materials refer to.
+    pub textures: Vec<Texture>,
     /// Point lights, spot lights, parallel light.
     pub beams: Vec<Beam>,
     /// The sky, if any.

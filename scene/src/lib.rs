@@ -2,6 +2,7 @@
 
 pub mod description;
 pub mod grid;
+pub mod image;
 pub mod import;
 pub mod inspect;
 pub mod manifest;

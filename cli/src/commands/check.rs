@@ -8,7 +8,7 @@ use std::process::ExitCode;
 use clap::Args;
 use rayherd_api::{RenderJob, RenderJobSpec};
 use rayherd_herd::job::spec::import_options;
-use rayherd_scene::description::{Beam, Bsdf, Description, Environment, Geometry, MeshFormat, Projection};
+use rayherd_scene::description::{Beam, Bsdf, Description, Environment, Geometry, MeshFormat, Projection, TextureKind};
 use rayherd_scene::import::{ImportOptions, Survey, import, sky_map};
 
 use super::{print, size};
@@ -61,6 +61,7 @@ fn problems(description: &Description, survey: &Survey) -> Vec<String> {
             Some(format!("{}: shape \"{}\": {}", shape.place, shape.name, crate::fault::tell(&error)))
         })
         .collect();
+    out.extend(survey.textures.iter().filter_map(|t| Some(t.as_ref().err()?.to_string())));
     if let Err(error) = sky_map(description.environment.as_ref()) {
         out.push(format!("the sky: {error}"));
     }
@@ -83,6 +84,10 @@ fn tell(scene: &str, description: &Description, survey: &Survey) -> String {
         line("box", format!("{lo:.4?} to {hi:.4?}"));
     }
     line("materials", kinds(description.materials.iter().map(|m| bsdf(&m.bsdf))));
+    if !description.textures.is_empty() {
+        let kinds = kinds(description.textures.iter().map(|t| texture(&t.kind)));
+        line("textures", format!("{kinds}; {} of texels", size(survey.texture_bytes())));
+    }
     line("lights", lights(description, survey));
     if let Some(camera) = &description.camera {
         let [w, h] = description.size.unwrap_or([0, 0]);
@@ -151,6 +156,13 @@ fn geometry(geometry: &Geometry) -> &'static str {
         Geometry::Inline { .. } => "rectangle, cube, disk or cylinder",
         Geometry::Sphere { .. } => "sphere",
         Geometry::IsoSurface { .. } => "surface of a volume",
+    }
+}
+
+fn texture(kind: &TextureKind) -> &'static str {
+    match kind {
+        TextureKind::Image { .. } => "image",
+        TextureKind::Checkerboard(_) => "checkerboard",
     }
 }
 

@@ -8,6 +8,7 @@ use clap::Args;
 use rayherd_api::{RenderJob, RenderJobSpec};
 use rayherd_herd::job::{JobError, PreparedScene};
 use rayherd_herd::resident::{Blocks, Resident};
+use rayherd_herd::textures::{DEFAULT_BUDGET, StoredTiles, TaskTextures, TileCache};
 use rayherd_render::bvh::{Kernel, Tracer};
 use rayherd_render::film::FilmPart;
 use rayherd_render::path::{Outcome, PathRay, ShadowRay, Surfaces, camera_ray, shade};
@@ -70,7 +71,9 @@ pub fn run(arguments: &Arguments) -> anyhow::Result<ExitCode> {
         film: FilmPart::new(frame.size),
         text: format!("pixel {x},{y} sample {} of {}, seed {}\n", arguments.sample, arguments.scene, frame.seed),
     };
-    let context = scene.context(&frame);
+    let (cache, tiles) = (TileCache::new(DEFAULT_BUDGET), StoredTiles(&scene));
+    let textures = TaskTextures::new(&scene, &cache, &tiles, 1);
+    let context = scene.context(&frame).with(&textures);
     let mut out = Outcome::default();
     let mut waiting = vec![camera_ray(&frame, y * width + x, arguments.sample)];
     while let Some(ray) = waiting.pop() {
@@ -78,6 +81,7 @@ pub fn run(arguments: &Arguments) -> anyhow::Result<ExitCode> {
         replay.tracer.closest(resident.forest(), &[ray.ray()], &mut hits);
         let before = out.counters;
         shade(&context, &surfaces, &[ray], &hits, &mut out);
+        textures.check()?;
         replay.vertex(&ray, &hits[0], &surfaces);
         replay.light(&out);
         out.shadow.iter().for_each(|shadow| replay.shadow(shadow));

@@ -7,6 +7,7 @@ use rayherd_render::frame::Frame;
 use rayherd_render::light::{Lights, SkyMap};
 use rayherd_render::path::Context;
 use rayherd_render::ray::Ray;
+use rayherd_render::texture::Texture;
 use rayherd_render::world::{Environment, World};
 use rayherd_scene::grid::Grid;
 use rayherd_scene::manifest::Manifest;
@@ -39,10 +40,17 @@ impl PreparedScene {
         let malformed =
             |e: serde_json::Error| JobError::Scene(format!("its world cannot be read: {e}; prepare it again"));
         let world: World = serde_json::from_slice(&bytes).map_err(malformed)?;
-        if world.shapes.iter().any(|s| s.material as usize >= world.materials.len())
-            || world.emissive.iter().any(|e| e.shape as usize >= world.shapes.len())
-        {
-            return Err(JobError::Scene("its world names shapes or materials that it lacks; prepare it again".into()));
+        let broken = |what: String| JobError::Scene(format!("its world cannot be used: {what}; prepare it again"));
+        world.check().map_err(broken)?;
+        let mut sizes = world.textures.iter().flat_map(|texture| {
+            let of = |n| match texture {
+                Texture::Bitmap(bitmap) => bitmap.tile_bytes(n),
+                Texture::Checkerboard(_) => 0,
+            };
+            texture.tiles().map(of)
+        });
+        if !manifest.tiles.iter().map(|t| Some(t.bytes)).eq(sizes.by_ref().map(Some)) {
+            return Err(broken("its textures have other tiles than the manifest".into()));
         }
         let sky_map = match &manifest.sky_map {
             Some(object) => {
@@ -86,9 +94,9 @@ impl PreparedScene {
         hasher.update(b"rayherd image 1\0").update(&self.manifest.content.0).update(&frame);
         Ok(hasher.finalize().to_hex().to_string())
     }
-    /// What every path of a frame shares.
+    /// What every path of a frame shares, but for textures.
     pub fn context<'a>(&'a self, frame: &'a Frame) -> Context<'a> {
-        Context { world: &self.world, lights: &self.lights, frame }
+        Context::new(&self.world, &self.lights, frame)
     }
 
     /// The split where each film tile's camera rays start: the owner of the first cell on the ray through the middle of

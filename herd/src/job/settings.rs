@@ -9,6 +9,7 @@ use rayherd_render::bvh::Kernel;
 
 use crate::local::faults::Faults;
 use crate::store::BlockStore;
+use crate::textures::DEFAULT_BUDGET;
 
 /// One node.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -44,6 +45,8 @@ pub struct JobSettings {
     pub nodes: Vec<NodeSpec>,
     /// Scene data (geometry and attributes) that a node may hold in memory, bytes; all of it if none.
     pub memory_per_node: Option<u64>,
+    /// Bytes of texture tiles that a node keeps in memory beside its scene data.
+    pub texture_memory: u64,
     /// Copies of each object, on as many nodes.
     pub replicas: u32,
     /// Whether a round ends before the next begins; the strategy's own way if none (`auto`: off, others: on).
@@ -75,6 +78,7 @@ impl Default for JobSettings {
             strategy: Strategy::Auto,
             nodes: vec![NodeSpec { slots: threads }],
             memory_per_node: None,
+            texture_memory: DEFAULT_BUDGET,
             replicas: 1,
             barrier: None,
             task_seconds: 10.0,

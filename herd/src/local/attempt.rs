@@ -19,6 +19,7 @@ use crate::resident::{Lease, Resident};
 use crate::task::codec;
 use crate::task::groups::{GroupSink, Groups};
 use crate::task::{CameraFeed, Loop, Outbox, Stop};
+use crate::textures::TaskTextures;
 use crate::wave::CameraUnit;
 use crate::wire::ray_group;
 
@@ -65,8 +66,8 @@ pub struct Shared<'a> {
 }
 
 impl Shared<'_> {
-    fn context(&self) -> Context<'_> {
-        self.scene.context(self.frame)
+    fn context<'c>(&'c self, textures: &'c TaskTextures) -> Context<'c> {
+        self.scene.context(self.frame).with(textures)
     }
     fn lease<'n>(&'n self, node: u32, set: &[u32]) -> Result<Lease<'n>, JobError> {
         let blocks = self.nodes.blocks(node);
@@ -102,13 +103,26 @@ pub fn run(shared: &Shared, attempt: &Attempt, stop: &dyn Stop) -> Result<Made, 
     let mut film = FilmPart::new(shared.frame.size);
     let mut camera = CameraFeed::new(shared.frame, attempt.camera.clone());
     let mut trace = Loop::new(shared.settings.kernel, shared.settings.batch as usize)?;
-    let mut task = Task { shared, attempt, stop, trace: &mut trace, camera: &mut camera, film: &mut film };
+    let tiles = shared.nodes.blocks(attempt.node);
+    let slots = shared.settings.nodes[attempt.node as usize].slots;
+    let textures = TaskTextures::new(shared.scene, shared.nodes.tiles(attempt.node), &tiles, slots);
+    let stop = Watch { stop, textures: &textures };
+    let mut task = Task {
+        shared,
+        attempt,
+        stop: &stop,
+        textures: &textures,
+        trace: &mut trace,
+        camera: &mut camera,
+        film: &mut film,
+    };
     match &attempt.set {
         Set::Resident(set) => task.resident(set, &mut groups)?,
         Set::Any => task.any()?,
         Set::Sharing(split) => task.sharing(*split, &mut groups)?,
         Set::Reduce => task.reduce(&mut groups)?,
     }
+    textures.check()?;
     let hops = if attempt.set == Set::Reduce { 0 } else { groups.rays };
     let rays = trace.rays;
     let groups = groups.finish()?;
@@ -125,10 +139,24 @@ pub fn run(shared: &Shared, attempt: &Attempt, stop: &dyn Stop) -> Result<Made, 
     Ok(Made { outputs: Outputs { groups, film: film_ref, rays, non_finite }, film, hops })
 }
 
+/// Stops also when a texture cannot be had: what is shaded without it is wrong.
+struct Watch<'a> {
+    stop: &'a dyn Stop,
+    textures: &'a TaskTextures<'a>,
+}
+
+impl Stop for Watch<'_> {
+    fn check(&self) -> Result<(), JobError> {
+        self.textures.check()?;
+        self.stop.check()
+    }
+}
+
 struct Task<'a, 'f> {
     shared: &'a Shared<'a>,
     attempt: &'a Attempt,
     stop: &'a dyn Stop,
+    textures: &'a TaskTextures<'a>,
     trace: &'a mut Loop,
     camera: &'a mut CameraFeed<'f>,
     film: &'a mut FilmPart,
@@ -159,7 +187,7 @@ impl Task<'_, '_> {
         let lease = shared.lease(node, set)?;
         let blocks = shared.nodes.blocks(node);
         let surfaces = lease.surfaces(shared.scene, &blocks)?;
-        let (context, grid) = (shared.context(), &shared.scene.grid);
+        let (context, grid) = (shared.context(self.textures), &shared.scene.grid);
         self.inputs(|t, mut flights| {
             if lease.is_complete() {
                 t.trace.run_complete(&context, &lease, &surfaces, &mut flights, t.camera, t.film, stop)
@@ -172,7 +200,7 @@ impl Task<'_, '_> {
     /// Demand driven: rays wait in the task for the splits that they need, which come and go one after the other.
     fn any(&mut self) -> Result<(), JobError> {
         let (shared, node, stop) = (self.shared, self.attempt.node, self.stop);
-        let (context, grid) = (shared.context(), &shared.scene.grid);
+        let (context, grid) = (shared.context(self.textures), &shared.scene.grid);
         let limit = (shared.settings.ray_buffer / size_of::<PathFlight>() as u64).max(1) as usize;
         let mut queues = Queues::default();
         let mut none = CameraFeed::new(shared.frame, Vec::new());
@@ -210,7 +238,7 @@ impl Task<'_, '_> {
     /// splits that share a cell with the chosen one, and a reduce step decides on the nearest hit.
     fn sharing(&mut self, split: u32, groups: &mut Groups) -> Result<(), JobError> {
         let (shared, node, stop) = (self.shared, self.attempt.node, self.stop);
-        let (context, grid) = (shared.context(), &shared.scene.grid);
+        let (context, grid) = (shared.context(self.textures), &shared.scene.grid);
         let together = grid.sharing(split);
         let set: SplitSet = together.iter().copied().collect();
         let limit = (shared.settings.ray_buffer / size_of::<PathFlight>() as u64).max(1) as usize;
@@ -276,7 +304,7 @@ impl Task<'_, '_> {
 
     /// Merges what map tasks found: of each ray the nearest candidate; it goes on to the next cell, or to its hit.
     fn reduce(&mut self, groups: &mut Groups) -> Result<(), JobError> {
-        let (shared, context) = (self.shared, self.shared.context());
+        let (shared, context) = (self.shared, self.shared.context(self.textures));
         let mut missed = Outcome::default();
         self.inputs(|t, mut flights| {
             flights.paths.sort_by_key(|f| (f.ray.key, f.candidate.t.to_bits(), f.candidate.prim));

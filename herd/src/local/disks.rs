@@ -121,7 +121,11 @@ fn indices(nodes: &[u32]) -> Vec<usize> {
 
 /// Key of a block: its kind, then its hash.
 fn key(kind: Kind, object: &ObjectRef) -> String {
-    let kind = if kind == Kind::Geometry { "geometry" } else { "attributes" };
+    let kind = match kind {
+        Kind::Geometry => "geometry",
+        Kind::Texture => "texture",
+        _ => "attributes",
+    };
     format!("{kind}/{}", object.hash)
 }
 

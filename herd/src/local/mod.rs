@@ -13,6 +13,8 @@ mod run;
 pub mod slots;
 #[cfg(test)]
 mod tests;
+#[cfg(test)]
+mod textured;
 mod threads;
 pub mod usage;
 

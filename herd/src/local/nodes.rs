@@ -16,6 +16,7 @@ use crate::plan::place;
 use crate::report::{Bytes, Kind, NodeReport, Op, Place, Stage};
 use crate::resident::{Blocks, Memory};
 use crate::store::{BlockStore, StoreError};
+use crate::textures::{TileCache, Tiles, tile_holders, tile_of};
 use crate::wire::WireError;
 
 /// Nodes that get a copy of each split: a function of the scene and their number, so that all who ask agree.
@@ -30,13 +31,22 @@ pub fn placement(scene: &PreparedScene, nodes: u32, replicas: u32) -> Vec<Vec<u3
     holders
 }
 
-/// Reads blocks of the scene from the stores of real nodes.
+/// What an object of the scene belongs to, and so where it lies.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Part {
+    /// A split, by number.
+    Split(u32),
+    /// A tile of a texture, by number.
+    Tile(u32),
+}
+
+/// Reads blocks and tiles of the scene from the stores of real nodes.
 pub trait Fetch: Send + Sync {
-    /// An object of a split, and whether it lay on the node that asks.
+    /// An object, and whether it lay on the node that asks.
     ///
     /// # Errors
     /// When no copy can be had.
-    fn fetch(&self, split: u32, object: &ObjectRef) -> Result<(Vec<u8>, Place), JobError>;
+    fn fetch(&self, part: Part, object: &ObjectRef) -> Result<(Vec<u8>, Place), JobError>;
 }
 
 /// All nodes.
@@ -49,6 +59,7 @@ pub struct Nodes<'a> {
     keepers: u32,
     fetch: Option<Box<dyn Fetch + 'a>>,
     memories: Vec<Memory>,
+    tiles: Vec<TileCache>,
     /// None for a single node, and for real ones.
     disks: Option<Disks>,
     /// Nodes that hold a split, by split number.
@@ -96,6 +107,7 @@ impl<'a> Nodes<'a> {
             runtime,
             replicas,
             memories: settings.nodes.iter().map(|_| Memory::new(memory)).collect(),
+            tiles: settings.nodes.iter().map(|_| TileCache::new(settings.texture_memory)).collect(),
             holders: RwLock::new(holders),
             counts: Mutex::new(Counts { nodes, ..Counts::default() }),
         })
@@ -104,6 +116,10 @@ impl<'a> Nodes<'a> {
     /// A node's memory.
     pub fn memory(&self, node: u32) -> &Memory {
         &self.memories[node as usize]
+    }
+    /// A node's texture tiles.
+    pub fn tiles(&self, node: u32) -> &TileCache {
+        &self.tiles[node as usize]
     }
     /// Nodes that hold each split.
     pub fn holders(&self) -> Vec<Vec<u32>> {
@@ -152,8 +168,9 @@ impl<'a> Nodes<'a> {
     pub fn report(&self) -> (Bytes, Vec<NodeReport>) {
         let counts = self.counts.lock().unwrap_or_else(PoisonError::into_inner);
         let mut nodes = counts.nodes.clone();
-        for (report, memory) in nodes.iter_mut().zip(&self.memories) {
+        for ((report, memory), tiles) in nodes.iter_mut().zip(&self.memories).zip(&self.tiles) {
             report.peak_scene_bytes = memory.peak();
+            report.peak_texture_bytes = tiles.peak();
         }
         (counts.bytes.clone(), nodes)
     }
@@ -268,6 +285,7 @@ impl<'a> Nodes<'a> {
         let keys: Vec<String> = keys.into_iter().map(|k| k.0).collect();
         self.wait(self.store.delete(&keys))?;
         self.memories[node as usize].clear();
+        self.tiles[node as usize].clear();
         let count = self.memories.len() as u32;
         let mut moved = Vec::new();
         {
@@ -286,6 +304,14 @@ impl<'a> Nodes<'a> {
                         moved.push((kind, object, on.clone()));
                     }
                 }
+            }
+        }
+        // tiles lie where their numbers say: the node, which is empty now, gets those that others hold
+        for (number, object) in (0..).zip(&self.scene.manifest.tiles) {
+            let on = tile_holders(number, count, self.replicas);
+            if on.len() > 1 && on.contains(&node) {
+                self.count(Stage::Trace, Op::Write, Kind::Texture, node, Place::Remote, object.bytes);
+                moved.push((Kind::Texture, object, on));
             }
         }
         match &self.disks {
@@ -307,10 +333,10 @@ pub struct NodeBlocks<'n, 'a> {
 }
 
 impl NodeBlocks<'_, '_> {
-    fn read(&self, split: u32, kind: Kind, object: &ObjectRef) -> Result<Vec<u8>, JobError> {
+    fn read(&self, part: Part, kind: Kind, object: &ObjectRef) -> Result<Vec<u8>, JobError> {
         let (nodes, node) = (self.nodes, self.node);
         if let Some(fetch) = &nodes.fetch {
-            let (bytes, place) = fetch.fetch(split, object)?;
+            let (bytes, place) = fetch.fetch(part, object)?;
             nodes.count(Stage::Trace, Op::Read, kind, node, place, bytes.len() as u64);
             return Ok(bytes);
         }
@@ -319,7 +345,10 @@ impl NodeBlocks<'_, '_> {
             nodes.count(Stage::Trace, Op::Read, kind, node, Place::Local, bytes.len() as u64);
             return Ok(bytes);
         };
-        let holders = nodes.holders.read().unwrap_or_else(PoisonError::into_inner)[split as usize].clone();
+        let holders = match part {
+            Part::Split(n) => nodes.holders.read().unwrap_or_else(PoisonError::into_inner)[n as usize].clone(),
+            Part::Tile(n) => tile_holders(n, nodes.memories.len() as u32, nodes.replicas),
+        };
         let read = disks.read(node, (kind, object), &holders, nodes.scene.objects.as_ref());
         let (body, counted) = nodes.wait(read)?;
         counted.rows().iter().for_each(|r| nodes.count(r.stage, r.op, r.kind, node, r.place, r.bytes));
@@ -338,9 +367,19 @@ impl NodeBlocks<'_, '_> {
 
 impl Blocks for NodeBlocks<'_, '_> {
     fn geometry(&self, split: u32) -> Result<Vec<u8>, JobError> {
-        self.read(split, Kind::Geometry, &self.nodes.scene.manifest.splits[split as usize].geometry)
+        self.read(Part::Split(split), Kind::Geometry, &self.nodes.scene.manifest.splits[split as usize].geometry)
     }
     fn attributes(&self, split: u32) -> Result<Vec<u8>, JobError> {
-        self.read(split, Kind::Attributes, &self.nodes.scene.manifest.splits[split as usize].attributes)
+        self.read(Part::Split(split), Kind::Attributes, &self.nodes.scene.manifest.splits[split as usize].attributes)
+    }
+}
+
+impl Tiles for NodeBlocks<'_, '_> {
+    fn tile(&self, number: u32) -> Result<Vec<u8>, JobError> {
+        self.read(Part::Tile(number), Kind::Texture, tile_of(self.nodes.scene, number)?)
+    }
+    fn warm(&self, number: u32) {
+        let bytes = self.nodes.scene.manifest.tiles.get(number as usize).map_or(0, |t| t.bytes);
+        self.nodes.count(Stage::Trace, Op::Read, Kind::Texture, self.node, Place::Cache, bytes);
     }
 }

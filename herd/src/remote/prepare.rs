@@ -17,6 +17,7 @@ use crate::job::spec::{import_options, prepare_settings};
 use crate::job::{JobError, PreparedScene};
 use crate::local::nodes::placement;
 use crate::store::{BlockStore, NodeView, SceneObjects, check_key, object_key};
+use crate::textures::tile_holders;
 
 /// Prepares the scene of a checked job, unless it is prepared; its manifest, and whether it was there.
 ///
@@ -54,6 +55,10 @@ pub fn prepare_scene(
             let on: Vec<usize> = on.into_iter().map(|n| n as usize).collect();
             put(&on, &split.geometry)?;
             put(&on, &split.attributes)?;
+        }
+        for (number, tile) in (0..).zip(&prepared.manifest.tiles) {
+            let on: Vec<usize> = tile_holders(number, depot.len(), replicas).into_iter().map(|n| n as usize).collect();
+            put(&on, tile)?;
         }
         put(&[], &prepared.manifest.world)?;
         if let Some(map) = &prepared.manifest.sky_map {

@@ -20,13 +20,14 @@ use crate::job::spec::definition;
 use crate::job::{Image, JobError, JobSettings, NodeSpec, PreparedScene};
 use crate::ledger::FilmRef;
 use crate::local::attempt::{self, Attempt, Shared};
-use crate::local::nodes::{Fetch, Nodes, placement};
+use crate::local::nodes::{Fetch, Nodes, Part, placement};
 use crate::local::slots::StopFlag;
 use crate::local::usage::thread_cpu;
 use crate::picture;
 use crate::report::{Bytes, Kind, Place};
 use crate::store::{SceneObjects, StoreError, object_key};
 use crate::task::codec;
+use crate::textures::tile_holders;
 
 /// Between two signs of life.
 const BEAT: Duration = Duration::from_secs(1);
@@ -167,7 +168,8 @@ impl<'l> Station<'l> {
             ..JobSettings::default()
         };
         let part = Arc::new(self.depot.part(&stage.prefix, stage.replicas)?);
-        let near = Near { station: self, placement: placement(&scene, disks, stage.replicas) };
+        let placement = placement(&scene, disks, stage.replicas);
+        let near = Near { station: self, placement, replicas: stage.replicas };
         let nodes = Nodes::real(&scene, &settings, part, disks, Some(Box::new(near)))?;
         let shared = Shared {
             scene: &scene,
@@ -346,13 +348,18 @@ impl<'l> Station<'l> {
 struct Near<'s, 'l> {
     station: &'s Station<'l>,
     placement: Vec<Vec<u32>>,
+    replicas: u32,
 }
 
 impl Fetch for Near<'_, '_> {
-    fn fetch(&self, split: u32, object: &ObjectRef) -> Result<(Vec<u8>, Place), JobError> {
+    fn fetch(&self, part: Part, object: &ObjectRef) -> Result<(Vec<u8>, Place), JobError> {
         let depot = &self.station.depot;
         let home = depot.home();
-        let holders = self.placement[split as usize].iter().copied().filter(|&h| Some(h) != home);
+        let holders = match part {
+            Part::Split(n) => self.placement[n as usize].clone(),
+            Part::Tile(n) => tile_holders(n, depot.len(), self.replicas),
+        };
+        let holders = holders.into_iter().filter(|&h| Some(h) != home);
         let mut order: Vec<u32> = home.into_iter().chain(holders).collect();
         order.extend((0..depot.len()).filter(|n| !order.contains(n)).collect::<Vec<u32>>());
         let key = object_key(&object.hash);

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicU32, Ordering};
-use std::sync::{Arc, Mutex};
+use std::sync::{Arc, LazyLock, Mutex};
 use std::time::{Duration, Instant};
 
 use rayherd_api::{RenderJobSpec, Strategy};
@@ -20,8 +20,27 @@ use crate::picture;
 use crate::report;
 use crate::store::{BlockStore, FaultPlan, Faulty, MemoryStore};
 
-const CORNELL: &str = include_str!("../../../examples/cornell-box.xml");
+const EXAMPLE: &str = include_str!("../../../examples/cornell-box.xml");
 const SOURCE: &str = "scenes/cornell/box.xml";
+const TEXTURE: &str = "scenes/cornell/wall.hdr";
+
+/// The example, with a picture on its red wall.
+static CORNELL: LazyLock<String> = LazyLock::new(|| {
+    let red = EXAMPLE.find("id=\"red\"").unwrap();
+    let from = red + EXAMPLE[red..].find("<rgb").unwrap();
+    let to = from + EXAMPLE[from..].find("/>").unwrap() + 2;
+    let texture =
+        "<texture type=\"bitmap\" name=\"reflectance\"><string name=\"filename\" value=\"wall.hdr\"/></texture>";
+    format!("{}{texture}{}", &EXAMPLE[..from], &EXAMPLE[to..])
+});
+
+/// 150 x 130 texels: four tiles.
+fn wall() -> Vec<u8> {
+    let head = "#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 130 +X 150\n";
+    // no row begins as one of runs does
+    let texels = (0..130 * 150u32).flat_map(|i| [200, (i % 97) as u8, (i % 61) as u8, 128]);
+    head.bytes().chain(texels).collect()
+}
 
 /// Messages as text, as over the wire.
 struct Wire<'a> {
@@ -99,7 +118,8 @@ fn spec(strategy: Strategy, splits: i64, replicas: i32) -> RenderJobSpec {
 fn expected(spec: &RenderJobSpec) -> Vec<u8> {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("box.xml");
-    std::fs::write(&path, CORNELL).unwrap();
+    std::fs::write(&path, CORNELL.as_str()).unwrap();
+    std::fs::write(folder.path().join("wall.hdr"), wall()).unwrap();
     let description = import(&path, &from_spec::import_options(spec)).unwrap();
     let source = DescriptionSource::new(&description, StreamOptions::default());
     let objects = Arc::new(MemoryObjects::default());
@@ -124,7 +144,8 @@ impl Cluster {
         let memory = || Arc::new(Faulty::new(Arc::new(MemoryStore::default()), FaultPlan::default()));
         let cluster =
             Cluster { stores: (0..nodes).map(|_| memory()).collect(), runtime, scratch: tempfile::tempdir().unwrap() };
-        cluster.runtime.block_on(cluster.stores[0].put(SOURCE, CORNELL.into())).unwrap();
+        cluster.runtime.block_on(cluster.stores[0].put(SOURCE, CORNELL.clone().into())).unwrap();
+        cluster.runtime.block_on(cluster.stores[0].put(TEXTURE, wall().into())).unwrap();
         cluster
     }
     fn depot(&self, home: Option<u32>) -> Depot {

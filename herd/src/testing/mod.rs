@@ -1,12 +1,14 @@
 //! Small scenes for tests.
 
+use std::path::Path;
 use std::sync::Arc;
 
 use rayherd_render::camera::Camera;
 use rayherd_render::filter::Filter;
 use rayherd_render::frame::Frame;
 use rayherd_scene::description::{
-    Affine, Bsdf, Description, Distribution, Environment, Geometry, Material, Place, Shape,
+    Affine, Amount, Bsdf, Checkerboard, Description, Detail, Distribution, Environment, Geometry, Material, Place,
+    Relief, ReliefKind, Shape, Slot, TexelFilter, Texture, TextureKind, Textured, Transmittance, UvMap, Wrap,
 };
 use rayherd_scene::import::{DescriptionSource, StreamOptions};
 use rayherd_scene::objects::MemoryObjects;
@@ -49,7 +51,7 @@ fn shape(name: &str, geometry: Geometry, material: u32, emission: Option<[f32; 3
 }
 
 fn material(name: &str, bsdf: Bsdf) -> Material {
-    Material { name: name.to_owned(), bsdf, two_sided: true }
+    Material::new(name, bsdf, true)
 }
 
 /// A box with coloured walls, open to the camera, a light below its ceiling, a block, a matt and a metal ball.
@@ -83,6 +85,7 @@ pub fn cornell() -> Description {
     Description {
         shapes,
         materials,
+        textures: vec![],
         beams: vec![],
         environment: Some(Environment::Constant([0.05, 0.06, 0.08])),
         camera: None,
@@ -96,6 +99,69 @@ pub fn cornell() -> Description {
         bounds: None,
         bytes_read: 0,
     }
+}
+
+/// The box with pictures on its walls, holes, bumps and a textured coat; its files lie in the folder.
+pub fn textured(folder: &Path) -> Description {
+    let path = folder.join("wall.png");
+    let mut png = Vec::new();
+    let size = [300, 200];
+    let mut encoder = png::Encoder::new(&mut png, size[0], size[1]);
+    encoder.set_color(png::ColorType::Rgb);
+    let texels: Vec<u8> = (0..size[0] * size[1] * 3).map(|i| (i.wrapping_mul(2_654_435_761) >> 24) as u8).collect();
+    encoder.write_header().unwrap().write_image_data(&texels).unwrap();
+    std::fs::write(&path, png).unwrap();
+    let image = |raw, wrap| Texture {
+        place: Place::default(),
+        kind: TextureKind::Image {
+            path: path.clone(),
+            raw,
+            wrap,
+            filter: TexelFilter::Bilinear,
+            to_uv: UvMap([[1.5, 0.2, 0.1], [0.0, 2.0, -0.3]]),
+        },
+    };
+    let squares = Checkerboard { to_uv: UvMap::IDENTITY, colors: [[0.9, 0.2, 0.1], [0.1, 0.3, 0.8]] };
+    let mut out = cornell();
+    out.textures = vec![
+        image(false, Wrap::Repeat),
+        image(true, Wrap::Mirror),
+        Texture { place: Place::default(), kind: TextureKind::Checkerboard(squares) },
+    ];
+    for shape in &mut out.shapes {
+        if let Geometry::Inline { positions, uv, .. } = &mut shape.geometry {
+            let n = (positions.len() as f64).sqrt() as usize;
+            let at = |i: usize| [i % n, i / n].map(|k| k as f32 / (n - 1) as f32);
+            *uv = (0..positions.len()).map(at).collect();
+        }
+    }
+    let painted = |texture| vec![Textured { slot: Slot::Diffuse, texture }];
+    let coat = Transmittance::new(Distribution::Ggx, 0.2, 1.5);
+    let plastic = Bsdf::RoughPlastic {
+        distribution: Distribution::Ggx,
+        alpha: 0.2,
+        eta: 1.5,
+        diffuse: [0.5; 3],
+        specular: [1.0; 3],
+        nonlinear: true,
+        coat,
+    };
+    let relief = Some(Relief { kind: ReliefKind::Bump(0.002), texture: 1, mirrored: false });
+    let grey = Bsdf::Diffuse { reflectance: [0.6; 3] };
+    let details = [
+        (grey.clone(), Detail { textured: painted(0), ..Detail::default() }),
+        (plastic, Detail { textured: painted(1), ..Detail::default() }),
+        (grey.clone(), Detail { opacity: Amount::Texture(1), textured: painted(2), ..Detail::default() }),
+        (grey, Detail { relief, ..Detail::default() }),
+    ];
+    let first = out.materials.len() as u32;
+    for (i, (bsdf, detail)) in details.into_iter().enumerate() {
+        out.materials.push(Material { detail: Some(Box::new(detail)), ..material(&format!("detail {i}"), bsdf) });
+    }
+    for (i, shape) in (0..).zip(out.shapes.iter_mut().filter(|s| s.emission.is_none())) {
+        shape.material = first + i % 4;
+    }
+    out
 }
 
 /// A closed box whose walls all emit 1 and reflect half of what they get.

@@ -10,11 +10,7 @@ use crate::world::{EmissivePrimitive, Environment, ShapeInfo};
 /// A world of emissive primitives, each of the shape and the radiance given.
 fn world(primitives: &[(Primitive, u32)], radiances: &[f32], environment: Option<[f32; 3]>) -> World {
     World {
-        materials: vec![Material {
-            name: String::new(),
-            bsdf: Bsdf::Diffuse { reflectance: [0.5; 3] },
-            two_sided: true,
-        }],
+        materials: vec![Material::new("", Bsdf::Diffuse { reflectance: [0.5; 3] }, true)],
         shapes: radiances
             .iter()
             .map(|&r| ShapeInfo { name: String::new(), material: 0, emission: Some([r; 3]) })
@@ -28,6 +24,7 @@ fn world(primitives: &[(Primitive, u32)], radiances: &[f32], environment: Option
         environment: environment.map(Environment::Constant),
         lo: [-2.0; 3],
         hi: [2.0; 3],
+        ..World::default()
     }
 }
 

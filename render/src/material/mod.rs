@@ -4,6 +4,7 @@
 //! directions point away from the surface: `wo` has z above 0, and so has what is reflected; what is transmitted has z below 0.
 
 mod conductor;
+mod detail;
 mod dielectric;
 mod diffuse;
 mod plastic;
@@ -14,6 +15,7 @@ mod tests;
 use glam::Vec3;
 use serde::{Deserialize, Serialize};
 
+pub use detail::{Amount, Detail, Relief, ReliefKind, Slot, Textured};
 pub use plastic::Transmittance;
 
 use dielectric::RoughInterface;
@@ -30,6 +32,8 @@ pub enum Distribution {
 }
 
 /// A reflectance model. RGB values are linear Rec. 709 in [0, 1] unless said.
+// a coat's table lies in it: the copy that a textured hit makes takes no memory from the heap
+#[allow(clippy::large_enum_variant)]
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub enum Bsdf {
     /// Lambertian reflection.
@@ -129,6 +133,22 @@ pub struct Material {
     pub bsdf: Bsdf,
     /// Whether the back side reflects like the front; a one-sided opaque surface is black from behind.
     pub two_sided: bool,
+    /// What varies over the surface, if anything does.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub detail: Option<Box<Detail>>,
+}
+
+impl Material {
+    /// One that is the same everywhere.
+    pub fn new(name: impl Into<String>, bsdf: Bsdf, two_sided: bool) -> Self {
+        Material { name: name.into(), bsdf, two_sided, detail: None }
+    }
+
+    /// Whether every ray from one place goes on the same way.
+    #[inline(always)]
+    pub fn is_mirror(&self) -> bool {
+        self.bsdf.is_mirror() && self.detail.as_ref().is_none_or(|d| d.is_paint())
+    }
 }
 
 /// What a BSDF does to one pair of directions.

@@ -18,15 +18,15 @@ const ENTRIES: usize = 64;
 
 /// What a rough coat lets in, and throws back inside; made by [`Transmittance::new`].
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(try_from = "Stored")]
+#[serde(try_from = "Stored", into = "Stored")]
 pub struct Transmittance {
     /// Share that enters, by cosine.
-    entering: Vec<f32>,
+    entering: [f32; ENTRIES],
     /// Share of diffuse light from inside that is thrown back.
     internal: f32,
 }
 
-#[derive(Deserialize)]
+#[derive(Serialize, Deserialize)]
 struct Stored {
     entering: Vec<f32>,
     internal: f32,
@@ -36,10 +36,18 @@ impl TryFrom<Stored> for Transmittance {
     type Error = String;
     fn try_from(s: Stored) -> Result<Transmittance, String> {
         let share = |v: &f32| (0.0..=1.0).contains(v);
-        if s.entering.len() != ENTRIES || !s.entering.iter().all(share) || !share(&s.internal) {
-            return Err(format!("a coat's transmittance needs {ENTRIES} values in [0, 1] and one more"));
+        match <[f32; ENTRIES]>::try_from(s.entering) {
+            Ok(entering) if entering.iter().all(share) && share(&s.internal) => {
+                Ok(Transmittance { entering, internal: s.internal })
+            }
+            _ => Err(format!("a coat's transmittance needs {ENTRIES} values in [0, 1] and one more")),
         }
-        Ok(Transmittance { entering: s.entering, internal: s.internal })
+    }
+}
+
+impl From<Transmittance> for Stored {
+    fn from(t: Transmittance) -> Stored {
+        Stored { entering: t.entering.to_vec(), internal: t.internal }
     }
 }
 
@@ -52,7 +60,7 @@ impl Transmittance {
         let rough = Rough::new(distribution, [alpha; 2]);
         // at a cosine of 0 nothing is visible: its limit
         let cosine = |i: usize| (i as f32 / (ENTRIES - 1) as f32).max(1e-6);
-        let entering = (0..ENTRIES).map(|i| share(&rough, cosine(i), eta, 32, false)).collect();
+        let entering = std::array::from_fn(|i| share(&rough, cosine(i), eta, 32, false));
         let sum: f64 =
             (0..ENTRIES).map(|i| f64::from(share(&rough, cosine(i), 1.0 / eta, 64, true)) * f64::from(cosine(i))).sum();
         Transmittance { entering, internal: (2.0 * sum / ENTRIES as f64) as f32 }

@@ -1,5 +1,7 @@
 //! What a hit looks like from the side it was hit from.
 
+use std::f32::consts::{FRAC_1_PI, PI};
+
 use glam::Vec3;
 
 use super::Surface;
@@ -123,6 +125,79 @@ impl Interaction {
         offset_origin(&self.position, -self.normal)
     }
 
+    /// Texture coordinates: those of a triangle's vertices, interpolated, or the hit's own without; of a sphere its longitude and its colatitude from
+    /// z, in [0, 1].
+    pub(super) fn uv(&self, surface: &Surface, hit: &Hit) -> [f32; 2] {
+        match surface.geometry {
+            Primitive::Triangle(_) => triangle_uv(surface, hit),
+            Primitive::Sphere { flipped, .. } => {
+                let n = if flipped { -self.front } else { self.front };
+                let turn = libm::atan2f(n.y, n.x) * (0.5 * FRAC_1_PI);
+                let v = libm::atan2f((n.x * n.x + n.y * n.y).sqrt(), n.z) * FRAC_1_PI;
+                [if turn < 0.0 { turn + 1.0 } else { turn }, v]
+            }
+        }
+    }
+
+    /// Derivatives of the position by u and v; any two at right angles where the texture coordinates have no area.
+    fn partials(&self, surface: &Surface) -> [Vec3; 2] {
+        match surface.geometry {
+            Primitive::Triangle([a, b, c]) => {
+                let (e1, e2) = (Vec3::from(b) - Vec3::from(a), Vec3::from(c) - Vec3::from(a));
+                let Some([ta, tb, tc]) = surface.uv else { return [e1, e2] };
+                let (du1, dv1) = (tb[0] - ta[0], tb[1] - ta[1]);
+                let (du2, dv2) = (tc[0] - ta[0], tc[1] - ta[1]);
+                let inverse = 1.0 / (du1 * dv2 - dv1 * du2);
+                if !inverse.is_finite() {
+                    let basis = Basis::new(self.front);
+                    return [basis.s, basis.t];
+                }
+                [(e1 * dv2 - e2 * dv1) * inverse, (e2 * du1 - e1 * du2) * inverse]
+            }
+            Primitive::Sphere { radius, flipped, .. } => {
+                let n = if flipped { -self.front } else { self.front };
+                let ring = (n.x * n.x + n.y * n.y).sqrt();
+                let (cos, sin) = if ring > 0.0 { (n.x / ring, n.y / ring) } else { (1.0, 0.0) };
+                let du = Vec3::new(-n.y, n.x, 0.0) * (2.0 * PI * radius);
+                [du, Vec3::new(n.z * cos, n.z * sin, -ring) * (PI * radius)]
+            }
+        }
+    }
+
+    /// Turns the shading normal to that of a height field of this gradient by u and v above the surface (Blinn 1978, without the derivative
+    /// of the normal, as Mitsuba has it); it stays where the ray would see the turned one from behind.
+    pub(super) fn bump(&mut self, surface: &Surface, gradient: [f32; 2], mirrored: bool, d: Vec3) {
+        let n = if self.from_front { self.shading } else { -self.shading };
+        let [du, dv] = self.partials(surface);
+        let raise = |tangent: Vec3, slope: f32| tangent + n * (slope - n.dot(tangent));
+        let m = raise(du, gradient[0]).cross(raise(dv, gradient[1]));
+        self.turn(n, if m.dot(self.front) < 0.0 { -m } else { m }, mirrored, d);
+    }
+
+    /// Turns the shading normal to `local`, in the frame of the derivative by u and the normal of the front.
+    pub(super) fn turn_to(&mut self, surface: &Surface, local: Vec3, mirrored: bool, d: Vec3) {
+        let n = if self.from_front { self.shading } else { -self.shading };
+        let m = Basis::with_tangent(n, self.partials(surface)[0]).to_world(local);
+        self.turn(n, m, mirrored, d);
+    }
+
+    /// From the front's normal `n` to `m`, of any length.
+    fn turn(&mut self, n: Vec3, m: Vec3, mirrored: bool, d: Vec3) {
+        let length = m.length();
+        if !(length > 0.0 && length.is_finite()) {
+            return;
+        }
+        let m = m / length;
+        let m = match (self.from_front, mirrored) {
+            (true, _) => m,
+            (false, false) => -m,
+            (false, true) => m - n * (2.0 * n.dot(m)),
+        };
+        if m.dot(d) < 0.0 {
+            self.shading = m;
+        }
+    }
+
     /// The shading frame; its tangents follow the surface's parametrisation when `tangents` asks for it.
     #[inline(always)]
     pub(super) fn basis(&self, surface: &Surface, tangents: bool) -> Basis {
@@ -149,6 +224,13 @@ impl Interaction {
     }
 }
 
+/// Texture coordinates of a hit of a triangle.
+pub(super) fn triangle_uv(surface: &Surface, hit: &Hit) -> [f32; 2] {
+    let Some([a, b, c]) = surface.uv else { return [hit.u, hit.v] };
+    let w = 1.0 - hit.u - hit.v;
+    std::array::from_fn(|k| a[k] * w + b[k] * hit.u + c[k] * hit.v)
+}
+
 /// The interpolated shading normal, turned to the side of the geometric normal; the geometric normal itself where there is none,
 /// or where the ray sees the back of the interpolated one (which would be black, or let light through).
 fn interpolated(normals: &[[f32; 3]; 3], hit: &Hit, normal: Vec3, d: Vec3) -> Vec3 {
@@ -161,4 +243,111 @@ fn interpolated(normals: &[[f32; 3]; 3], hit: &Hit, normal: Vec3, d: Vec3) -> Ve
     let n = n / length;
     let n = if n.dot(normal) < 0.0 { -n } else { n };
     if n.dot(d) < 0.0 { n } else { normal }
+}
+
+#[cfg(test)]
+mod tests {
+    use glam::DVec3;
+
+    use super::*;
+    use crate::testing::Rng;
+
+    fn hit(u: f32, v: f32) -> Hit {
+        Hit { t: 1.0, u, v, prim: 0, leaf: 0, lane: 0 }
+    }
+
+    /// A bumped normal is that of the surface raised by the height, which is linear in u and v; seen from behind its other side, or its mirror image.
+    #[test]
+    fn bumps_are_normals_of_raised_surfaces() {
+        let mut rng = Rng(11);
+        let mut turned = 0;
+        for _ in 0..2000 {
+            let p = [rng.vec3(1.0), rng.vec3(1.0), rng.vec3(1.0)];
+            let uv = [0, 1, 2].map(|_| [rng.range(-1.0, 1.0), rng.range(-1.0, 1.0)]);
+            let surface = Surface {
+                shape: 0,
+                geometry: Primitive::Triangle(p.map(|v| v.to_array())),
+                normals: None,
+                uv: Some(uv),
+            };
+            let [a, b, c] = p.map(Vec3::as_dvec3);
+            let [ta, tb, tc] = uv.map(|t| t.map(f64::from));
+            let (e1, e2) = (b - a, c - a);
+            let n = e1.cross(e2).normalize();
+            let det = (tb[0] - ta[0]) * (tc[1] - ta[1]) - (tb[1] - ta[1]) * (tc[0] - ta[0]);
+            if det.abs() < 0.05 || e1.cross(e2).length() < 0.05 {
+                continue;
+            }
+            let gradient = [rng.range(-1.0, 1.0), rng.range(-1.0, 1.0)];
+            // heights at the vertices raise them along the normal
+            let height = |t: [f64; 2]| f64::from(gradient[0]) * t[0] + f64::from(gradient[1]) * t[1];
+            let raised = [(a, ta), (b, tb), (c, tc)].map(|(p, t)| p + n * height(t));
+            let up = (raised[1] - raised[0]).cross(raised[2] - raised[0]).normalize();
+            let up = if up.dot(n) < 0.0 { -up } else { up };
+            for (side, mirrored) in [(1.0, false), (-1.0, false), (-1.0, true)] {
+                let d = (n * -side).as_vec3();
+                let mut at = Interaction::new(Vec3::ZERO, d, &hit(0.2, 0.3), &surface).unwrap();
+                at.bump(&surface, gradient, mirrored, d);
+                let expected: DVec3 = match (side > 0.0, mirrored) {
+                    (true, _) => up,
+                    (false, false) => -up,
+                    (false, true) => up - n * (2.0 * up.dot(n)),
+                };
+                assert!((at.shading.as_dvec3() - expected).length() < 1e-3, "{} {expected}", at.shading);
+                turned += u32::from(!at.is_flat());
+            }
+        }
+        assert!(turned > 1000, "{turned}");
+    }
+
+    #[test]
+    fn a_normal_map_is_in_the_frame_of_u() {
+        let vertices = [[0.0, 0.0, 0.0], [2.0, 0.0, 0.0], [0.0, 3.0, 0.0]];
+        let uv = Some([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]);
+        let surface = Surface { shape: 0, geometry: Primitive::Triangle(vertices), normals: None, uv };
+        let d = Vec3::new(0.1, 0.2, -1.0).normalize();
+        let mut at = Interaction::new(Vec3::Z, d, &hit(0.2, 0.3), &surface).unwrap();
+        assert_eq!(at.uv(&surface, &hit(0.2, 0.3)), [0.2, 0.3]);
+        at.turn_to(&surface, Vec3::new(0.6, 0.0, 1.6), false, d);
+        assert!((at.shading - Vec3::new(0.6, 0.0, 1.6).normalize()).length() < 1e-6, "{}", at.shading);
+        // seen from behind by the ray, or of no length: it stays
+        for local in [Vec3::new(0.0, 1.0, 0.0), Vec3::ZERO, Vec3::NAN] {
+            let mut at = Interaction::new(Vec3::Z, d, &hit(0.2, 0.3), &surface).unwrap();
+            at.turn_to(&surface, local, false, d);
+            assert_eq!(at.shading, Vec3::Z);
+        }
+    }
+
+    /// Longitude and colatitude by their definition in f64, and derivatives as differences of positions.
+    #[test]
+    fn spheres_have_coordinates() {
+        let mut rng = Rng(12);
+        for k in 0..2000 {
+            let n = rng.direction();
+            let (center, radius, flipped) = ([0.5, -1.0, 2.0], 0.7, k % 2 == 0);
+            let surface =
+                Surface { shape: 0, geometry: Primitive::Sphere { center, radius, flipped }, normals: None, uv: None };
+            let o = Vec3::from(center) + n * 3.0;
+            let hit = Hit { t: 3.0 - radius, ..hit(0.0, 0.0) };
+            let at = Interaction::new(o, -n, &hit, &surface).unwrap();
+            let [u, v] = at.uv(&surface, &hit).map(f64::from);
+            let n = n.as_dvec3();
+            let turn = n.y.atan2(n.x).rem_euclid(std::f64::consts::TAU) / std::f64::consts::TAU;
+            let ring = n.x.hypot(n.y);
+            let colatitude = ring.atan2(n.z) / std::f64::consts::PI;
+            // an error of the normal is a larger one of the longitude near the poles
+            let error = (u - turn).abs().min(1.0 - (u - turn).abs());
+            assert!(error < 1e-6 / ring && (v - colatitude).abs() < 1e-6, "{n} {u} {v}");
+            let place = |u: f64, v: f64| {
+                let (phi, theta) = (u * std::f64::consts::TAU, v * std::f64::consts::PI);
+                DVec3::new(theta.sin() * phi.cos(), theta.sin() * phi.sin(), theta.cos()) * f64::from(radius)
+            };
+            let h = 1e-5;
+            let expected =
+                [place(u + h, v) - place(u - h, v), place(u, v + h) - place(u, v - h)].map(|d| d / (2.0 * h));
+            for (found, expected) in at.partials(&surface).into_iter().zip(expected) {
+                assert!((found.as_dvec3() - expected).length() < 1e-3 / ring, "{n}: {found} {expected}");
+            }
+        }
+    }
 }

@@ -22,6 +22,7 @@ use crate::light::Lights;
 use crate::math::UnitDir;
 use crate::ray::{Hit, PathKey, PrimId, Ray};
 use crate::sampler::Stream;
+use crate::texture::{NoTextures, Textures};
 use crate::world::{Primitive, World};
 
 pub use primary::camera_rays;
@@ -135,6 +136,20 @@ pub struct Context<'a> {
     pub lights: &'a Lights,
     /// The picture.
     pub frame: &'a Frame,
+    /// Tiles of the world's textures.
+    pub textures: &'a dyn Textures,
+}
+
+impl<'a> Context<'a> {
+    /// Of a world without bitmaps.
+    pub fn new(world: &'a World, lights: &'a Lights, frame: &'a Frame) -> Self {
+        Context { world, lights, frame, textures: &NoTextures }
+    }
+
+    /// With tiles.
+    pub fn with(self, textures: &'a dyn Textures) -> Self {
+        Context { textures, ..self }
+    }
 }
 
 /// What a batch became. Vectors are appended to, in the order of the rays; clear and use again.

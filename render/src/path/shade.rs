@@ -4,12 +4,13 @@ use glam::Vec3;
 
 use super::block::{Block, FlatDiffuse};
 use super::diffuse::{Fate, cosine_direction, onwards, snap, towards_light};
-use super::interaction::Interaction;
+use super::interaction::{Interaction, triangle_uv};
 use super::{Context, Contribution, Outcome, PathRay, ShadowRay, Surface, Surfaces, power_heuristic};
-use crate::material::{Bsdf, Material};
+use crate::material::{Bsdf, Detail, Material, Relief, ReliefKind};
 use crate::math::{UnitDir, unit};
 use crate::ray::{Hit, PathKey, Ray};
 use crate::sampler::{BSDF, LIGHT, LIGHT_CHOICE, LOBE, ROULETTE, Stream};
+use crate::world::Primitive;
 
 /// Shades each ray with its hit and appends what comes of it to `out`.
 ///
@@ -50,8 +51,8 @@ pub fn shade_traced<S: Surfaces>(
         let Some(Leaving { material, children, throughput }) = arrive(context, surfaces, index, ray, hit, out) else {
             continue;
         };
-        let flat = match &material.bsdf {
-            Bsdf::Diffuse { reflectance } => surfaces.flat_triangle(index, hit).map(|vertices| FlatDiffuse {
+        let flat = match (&material.bsdf, &material.detail) {
+            (Bsdf::Diffuse { reflectance }, None) => surfaces.flat_triangle(index, hit).map(|vertices| FlatDiffuse {
                 vertices,
                 u: hit.u,
                 v: hit.v,
@@ -59,6 +60,7 @@ pub fn shade_traced<S: Surfaces>(
                 reflectance: *reflectance,
                 two_sided: material.two_sided,
             }),
+            (Bsdf::Diffuse { .. }, Some(detail)) => painted(context, surfaces, index, hit, traced.d, material, detail),
             _ => None,
         };
         for child in 0..children {
@@ -131,6 +133,27 @@ struct Leaving<'a> {
     throughput: Vec3,
 }
 
+/// A hit of a flat triangle whose albedo alone is a texture's.
+#[inline(never)]
+fn painted<S: Surfaces>(
+    context: &Context,
+    surfaces: &S,
+    index: usize,
+    hit: &Hit,
+    d: [f32; 3],
+    material: &Material,
+    detail: &Detail,
+) -> Option<FlatDiffuse> {
+    if !detail.is_paint() {
+        return None;
+    }
+    let surface = surfaces.surface(index, hit);
+    let (Primitive::Triangle(vertices), None) = (surface.geometry, surface.normals) else { return None };
+    let uv = triangle_uv(&surface, hit);
+    let reflectance = material.albedo(detail, &context.world.textures, context.textures, uv)?;
+    Some(FlatDiffuse { vertices, u: hit.u, v: hit.v, d, reflectance, two_sided: material.two_sided })
+}
+
 /// Emission, depth and splitting; `None` when the path ends here.
 #[inline(always)]
 fn arrive<'a, S: Surfaces>(
@@ -158,7 +181,7 @@ fn arrive<'a, S: Surfaces>(
     let material = &world.materials[shape.material as usize];
     let throughput = Vec3::from(ray.throughput);
     // a mirror would send every sibling the same way
-    if number == 1 && frame.split > 1 && !material.bsdf.is_mirror() {
+    if number == 1 && frame.split > 1 && !material.is_mirror() {
         let share = throughput / frame.split as f32;
         return Some(Leaving { material, children: frame.split, throughput: share });
     }
@@ -218,13 +241,25 @@ pub(super) fn scatter_plain(
     let frame = context.frame;
     let material = &context.world.materials[context.world.shapes[surface.shape as usize].material as usize];
     let d = Vec3::from(ray.dir.decode());
-    let at = match Interaction::new(Vec3::from(ray.o), d, hit, surface) {
-        Some(at) if at.from_front || material.two_sided || material.bsdf.transmits() => at,
-        _ => {
-            out.counters.absorbed += 1;
-            return;
+    let Some(mut at) = Interaction::new(Vec3::from(ray.o), d, hit, surface) else {
+        out.counters.absorbed += 1;
+        return;
+    };
+    let look;
+    let (bsdf, opacity) = match material.detail.as_deref() {
+        None => (&material.bsdf, 1.0),
+        Some(detail) => {
+            let opacity;
+            (look, opacity) = appearance(context, material, detail, surface, hit, d, &mut at);
+            (look.as_ref().unwrap_or(&material.bsdf), opacity)
         }
     };
+    // what is behind a surface of one side is black, but for what passes beside it
+    let seen = at.from_front || material.two_sided || bsdf.transmits();
+    if !seen && opacity >= 1.0 {
+        out.counters.absorbed += 1;
+        return;
+    }
     let next_key = PathKey { vertex: key.vertex + 1, ..key };
     let numbers = Stream::new(frame.seed, key.pixel, key.sample).vertex(
         u32::from(next_key.vertex),
@@ -239,7 +274,7 @@ pub(super) fn scatter_plain(
 
     let place = [numbers[LIGHT], numbers[LIGHT + 1]];
     let light =
-        if material.bsdf.is_delta() { None } else { context.lights.sample(origin, numbers[LIGHT_CHOICE], place) };
+        if bsdf.is_delta() || !seen { None } else { context.lights.sample(origin, numbers[LIGHT_CHOICE], place) };
     let shadow = |o: Vec3, dir: UnitDir, tmax: f32, contribution: Vec3, out: &mut Outcome| {
         if contribution != Vec3::ZERO {
             let ray = ShadowRay { o: o.to_array(), dir, tmax, contribution: contribution.to_array(), key };
@@ -248,7 +283,8 @@ pub(super) fn scatter_plain(
         }
     };
 
-    let (o, dir, throughput, pdf, fate) = if let (Bsdf::Diffuse { reflectance }, true) = (&material.bsdf, at.is_flat())
+    let (o, dir, throughput, pdf, fate) = if let (Bsdf::Diffuse { reflectance }, true, true) =
+        (bsdf, at.is_flat(), opacity >= 1.0)
     {
         let reflectance = Vec3::from(*reflectance);
         if let Some(light) = light {
@@ -262,7 +298,6 @@ pub(super) fn scatter_plain(
         let (throughput, pdf, fate) = onwards(throughput, reflectance, at.normal, wi, above, go_on, roulette, siblings);
         (origin, dir, throughput, pdf, fate)
     } else {
-        let bsdf = &material.bsdf;
         let basis = at.basis(surface, bsdf.is_anisotropic());
         let wo = basis.to_local(-d);
         // a light behind a surface that lets light through is sampled from there
@@ -280,31 +315,48 @@ pub(super) fn scatter_plain(
             // by the geometric normal too, or light would leak through the surface
             if same_side(wi.dot(at.normal), local.z, bsdf.transmits()) {
                 let scattered = bsdf.eval(wo, local, at.from_front);
-                let weight = power_heuristic(light.pdf, scattered.pdf) / light.pdf;
-                shadow(from, dir, light.tmax, throughput * scattered.value * light.radiance * weight, out);
+                let weight = power_heuristic(light.pdf, scattered.pdf * opacity) / light.pdf;
+                let value = scattered.value * opacity;
+                shadow(from, dir, light.tmax, throughput * value * light.radiance * weight, out);
             }
         }
-        let Some(sampled) = bsdf.sample(wo, at.from_front, direction, unit(numbers[LOBE])) else {
+        let lobe = unit(numbers[LOBE]);
+        // at opacity 1 never, as the number is below 1
+        let passes = lobe >= opacity;
+        if !(passes || seen) {
             out.counters.absorbed += 1;
             return;
-        };
-        let dir = UnitDir::encode(basis.to_world(sampled.wi).to_array());
-        let wi = Vec3::from(dir.decode());
-        let (weight, pdf) = match sampled.delta {
-            Some(weight) => (weight, 0.0),
-            // of the direction as it travels
+        }
+        // what is left of the number when the material was met is as random; below 1 by rounding down
+        let lobe = if opacity < 1.0 { (lobe / opacity).min(1.0 - f32::EPSILON / 2.0) } else { lobe };
+        let sampled = if passes { None } else { bsdf.sample(wo, at.from_front, direction, lobe) };
+        let (dir, weight, pdf, leaves, o) = match sampled {
+            _ if passes => (ray.dir, Vec3::ONE, 0.0, true, at.origin_beyond()),
             None => {
-                let scattered = bsdf.eval(wo, basis.to_local(wi), at.from_front);
-                (scattered.value / scattered.pdf, scattered.pdf)
+                out.counters.absorbed += 1;
+                return;
+            }
+            Some(sampled) => {
+                let dir = UnitDir::encode(basis.to_world(sampled.wi).to_array());
+                let wi = Vec3::from(dir.decode());
+                let (weight, pdf) = match sampled.delta {
+                    Some(weight) => (weight, 0.0),
+                    // of the direction as it travels
+                    None => {
+                        let scattered = bsdf.eval(wo, basis.to_local(wi), at.from_front);
+                        (scattered.value / scattered.pdf, scattered.pdf * opacity)
+                    }
+                };
+                let leaves = same_side(wi.dot(at.normal), sampled.wi.z, bsdf.transmits());
+                (dir, weight, pdf, leaves, if sampled.wi.z < 0.0 { at.origin_beyond() } else { origin })
             }
         };
         let throughput = throughput * weight;
         let largest = throughput.max_element();
         // siblings are as likely to go on as an only child
         let chance = if roulette { (largest * siblings).min(0.95) } else { 1.0 };
-        let o = if sampled.wi.z < 0.0 { at.origin_beyond() } else { origin };
         // false for NaN: 0 / 0 of a direction that snapping took below the horizon
-        let fate = if !(same_side(wi.dot(at.normal), sampled.wi.z, bsdf.transmits()) && largest > 0.0) {
+        let fate = if !(leaves && largest > 0.0) {
             Fate::Absorbed
         } else if go_on >= chance {
             Fate::Roulette
@@ -322,6 +374,46 @@ pub(super) fn scatter_plain(
         Fate::Absorbed => out.counters.absorbed += 1,
         Fate::Roulette => out.counters.roulette += 1,
     }
+}
+
+/// What a material with detail looks like at a hit: its model (`None`: the material's own) and opacity. Turns the shading normal of `at`.
+#[inline(never)]
+fn appearance(
+    context: &Context,
+    material: &Material,
+    detail: &Detail,
+    surface: &Surface,
+    hit: &Hit,
+    d: Vec3,
+    at: &mut Interaction,
+) -> (Option<Bsdf>, f32) {
+    let (world, tiles) = (context.world, context.textures);
+    let uv = at.uv(surface, hit);
+    let opacity = detail.opacity.share(&world.textures, tiles, uv);
+    let back = if at.from_front { None } else { detail.back.map(|m| &world.materials[m as usize]) };
+    // of two materials each has its own textures and relief
+    let (material, inner) = match back {
+        Some(back) => (back, back.detail.as_deref()),
+        None => (material, Some(detail)),
+    };
+    let relief = inner.and_then(|detail| detail.relief);
+    if let Some(Relief { kind, texture, mirrored }) = relief {
+        let texture = &world.textures[texture as usize];
+        match kind {
+            ReliefKind::Bump(scale) => {
+                let gradient = texture.gradient(tiles, uv).map(|slope| slope * scale);
+                at.bump(surface, gradient, mirrored, d);
+            }
+            ReliefKind::Normals => {
+                at.turn_to(surface, texture.color(tiles, uv) * 2.0 - Vec3::ONE, mirrored, d);
+            }
+        }
+    }
+    let bsdf = match inner {
+        Some(detail) if !detail.textured.is_empty() => Some(material.at(detail, &world.textures, tiles, uv)),
+        _ => back.map(|back| back.bsdf.clone()),
+    };
+    (bsdf, opacity)
 }
 
 /// Whether a direction of cosine `geometric` to the geometric normal and `shading` to the shading normal leaves on one side by both; on the far side

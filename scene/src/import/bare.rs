@@ -73,7 +73,7 @@ pub(super) fn volume(path: &Path, options: &ImportOptions) -> Result<(Descriptio
 fn description(options: &ImportOptions) -> Description {
     let bsdf = Bsdf::Diffuse { reflectance: options.albedo.unwrap_or(DEFAULT_ALBEDO) };
     Description {
-        materials: vec![Material { name: "surface".into(), bsdf, two_sided: true }],
+        materials: vec![Material::new("surface", bsdf, true)],
         environment: Some(Environment::Constant(framing::SKY)),
         size: Some(options.size.unwrap_or(framing::SIZE)),
         ..Description::default()

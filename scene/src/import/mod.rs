@@ -3,7 +3,6 @@
 mod bare;
 mod bounds;
 mod framing;
-pub mod image;
 pub mod isosurface;
 mod mesh;
 mod metals;
@@ -153,7 +152,7 @@ fn place_camera(
     }
     let material = out.materials.len() as u32;
     let black = Bsdf::Diffuse { reflectance: [0.0; 3] };
-    out.materials.push(Material { name: "light".into(), bsdf: black, two_sided: false });
+    out.materials.push(Material::new("light", black, false));
     for (i, light) in lights.iter().enumerate() {
         let Some(shape) = light.shape(format!("light-{}", i + 1), material) else {
             return refuse(path, format!("light {} has no direction: its origin and target are one point", i + 1));

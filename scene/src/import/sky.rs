@@ -2,21 +2,21 @@
 
 use rayherd_render::light::{SkyMap, SkyMapError};
 
-use super::image::{ImageLimits, read_image};
 use super::vector::dot;
 use crate::ImportError;
 use crate::description::{Affine, Environment};
+use crate::image;
 
 /// Reads the picture of a sky, if that is one. Negative values, which filtering leaves in some pictures, become 0, and a warning says how many.
 ///
 /// # Errors
-/// As of [`read_image`]; or the picture has fewer than 1 x 2 pixels, or holds NaN or infinity.
+/// As of [`image::read`]; or the picture has fewer than 1 x 2 pixels, or holds NaN or infinity.
 pub fn sky_map(environment: Option<&Environment>) -> Result<Option<SkyMap>, ImportError> {
     let Some(Environment::Map { path, place, .. }) = environment else { return Ok(None) };
-    let mut image = read_image(path, &ImageLimits::default())?;
-    image.decode_srgb();
+    let image = image::read(path, false).map_err(|why| image::error(path, place, &why))?;
+    let [width, height] = image.header.size;
     let mut negative = 0u64;
-    let pixels = (0..image.height).flat_map(|y| (0..image.width).map(move |x| (x, y)));
+    let pixels = (0..height).flat_map(|y| (0..width).map(move |x| (x, y)));
     let texels = pixels.map(|(x, y)| {
         image.rgb(x, y).map(|v| {
             negative += u64::from(v < 0.0);
@@ -28,7 +28,7 @@ pub fn sky_map(environment: Option<&Environment>) -> Result<Option<SkyMap>, Impo
     if negative > 0 {
         tracing::warn!(file = %path.display(), values = negative, "negative values of the sky's picture are taken for 0");
     }
-    SkyMap::new(image.width, image.height, texels).map(Some).map_err(|e: SkyMapError| ImportError::Malformed {
+    SkyMap::new(width, height, texels).map(Some).map_err(|e: SkyMapError| ImportError::Malformed {
         place: place.clone(),
         message: format!("{}: {e}", path.display()),
     })

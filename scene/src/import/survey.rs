@@ -2,7 +2,8 @@
 
 use super::stream::{DescriptionSource, StreamOptions};
 use crate::ImportError;
-use crate::description::Description;
+use crate::description::{Description, TextureKind};
+use crate::image;
 use crate::record::Record;
 
 /// Of a geometry object a triangle takes about this (eight-wide nodes, vertices, ids; measured 51.8 on 8 million triangles).
@@ -13,6 +14,8 @@ const BYTES_PER_TRIANGLE: u64 = 52;
 pub struct Survey {
     /// By shape.
     pub shapes: Vec<ShapeSurvey>,
+    /// By texture: bytes of its texels, or why it could not be read to its end.
+    pub textures: Vec<Result<u64, ImportError>>,
     /// World-space box of all finite primitives; least above greatest if there are none.
     pub bounds: [[f64; 3]; 2],
     /// Bytes of the source that were read for it.
@@ -39,10 +42,19 @@ pub struct ShapeSurvey {
 }
 
 impl Survey {
-    /// Reads every shape once. What cannot be read is noted, and the next shape is read.
+    /// Reads every shape and every texture once. What cannot be read is noted, and the next one is read.
     pub fn of(description: &Description) -> Survey {
         let source = DescriptionSource::new(description, StreamOptions::default());
-        let mut out = Survey { shapes: Vec::new(), bounds: super::bounds::EMPTY, bytes_read: 0 };
+        let mut out = Survey { shapes: Vec::new(), textures: Vec::new(), bounds: super::bounds::EMPTY, bytes_read: 0 };
+        for texture in &description.textures {
+            let TextureKind::Image { path, raw, .. } = &texture.kind else {
+                out.textures.push(Ok(0));
+                continue;
+            };
+            let read = image::read(path, *raw).map_err(|why| image::error(path, &texture.place, &why));
+            out.bytes_read += std::fs::metadata(path).map_or(0, |m| m.len());
+            out.textures.push(read.map(|image| image.header.bytes()));
+        }
         for number in 0..description.shapes.len() {
             let mut shape = ShapeSurvey::default();
             match read(&source, number, &mut shape, &mut out.bounds) {
@@ -60,9 +72,16 @@ impl Survey {
     }
 
     /// About what the prepared scene takes, bytes, without copies by overlap reduction: trees and vertices; shape numbers, normals and
-    /// texture coordinates.
+    /// texture coordinates; texels.
     pub fn prepared_bytes(&self) -> u64 {
-        self.sum(|s| s.triangles * (BYTES_PER_TRIANGLE + 4) + s.with_normals * 36 + s.with_uv * 24 + s.spheres * 32)
+        let shapes = self
+            .sum(|s| s.triangles * (BYTES_PER_TRIANGLE + 4) + s.with_normals * 36 + s.with_uv * 24 + s.spheres * 32);
+        shapes + self.texture_bytes()
+    }
+
+    /// Bytes of the texels of all textures.
+    pub fn texture_bytes(&self) -> u64 {
+        self.textures.iter().flatten().sum()
     }
 }
 

@@ -22,6 +22,9 @@ impl Manifest {
         if self.splits.len() >= 1 << 22 {
             return Err("it has too many splits".to_owned());
         }
+        if self.tiles.len() >= 1 << 28 {
+            return Err("it has too many texture tiles".to_owned());
+        }
         if (self.grid.lo, self.grid.hi) != (self.lo, self.hi) {
             return Err("the grid's box is not the scene's".to_owned());
         }

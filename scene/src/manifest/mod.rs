@@ -4,6 +4,8 @@ mod check;
 #[cfg(test)]
 pub(crate) mod tests;
 
+use std::collections::BTreeSet;
+
 use rayherd_render::filter::Filter;
 use rayherd_render::ray::PrimId;
 use serde::{Deserialize, Serialize};
@@ -41,6 +43,8 @@ pub struct Manifest {
     pub world: ObjectRef,
     /// The picture of the sky, [`rayherd_render::light::SkyMap`], if the world has one; put as [`ObjectKind::Texture`].
     pub sky_map: Option<ObjectRef>,
+    /// Tiles of textures, by their number in the world.
+    pub tiles: Vec<ObjectRef>,
     /// Splits by number: those cut from the source, in its order, then the copied ones.
     pub splits: Vec<SplitEntry>,
     /// The scheduling grid.
@@ -261,14 +265,19 @@ impl Manifest {
 
     /// Every object that it names, but itself.
     pub fn objects(&self) -> impl Iterator<Item = &ObjectRef> {
-        std::iter::once(&self.world)
-            .chain(&self.sky_map)
-            .chain(self.splits.iter().flat_map(|s| [&s.geometry, &s.attributes]))
+        let splits = self.splits.iter().flat_map(|s| [&s.geometry, &s.attributes]);
+        std::iter::once(&self.world).chain(&self.sky_map).chain(&self.tiles).chain(splits)
     }
 
-    /// Geometry and attribute bytes, copies left out: what a pass over the scene reads.
+    /// Bytes of geometry, attributes and texture tiles, copies left out and equal tiles once: what a pass over the scene reads.
     pub fn scene_bytes(&self) -> u64 {
-        self.splits.iter().filter(|s| !s.copied).map(|s| s.geometry.bytes + s.attributes.bytes).sum()
+        let splits: u64 = self.splits.iter().filter(|s| !s.copied).map(|s| s.geometry.bytes + s.attributes.bytes).sum();
+        splits + self.texture_bytes()
+    }
+
+    /// Bytes of texture tiles, equal ones once.
+    pub fn texture_bytes(&self) -> u64 {
+        self.tiles.iter().collect::<BTreeSet<_>>().into_iter().map(|t| t.bytes).sum()
     }
 
     /// Its grid, ready to be walked.

@@ -37,6 +37,7 @@ pub(crate) fn sample() -> Manifest {
         hi: [1.0; 3],
         world: object("world"),
         sky_map: Some(object("sky")),
+        tiles: vec![object("tile"), object("tile"), object("other tile")],
         splits: vec![split(0, false), split(1, false), split(2, true)],
         grid: GridData {
             subdiv: 2,
@@ -86,6 +87,8 @@ fn a_scene_is_found_only_when_it_is_whole() {
     assert!(find(&store, &manifest).is_none(), "its objects are missing");
     store.put(ObjectKind::Manifest, b"world").unwrap();
     store.put(ObjectKind::Texture, b"sky").unwrap();
+    store.put(ObjectKind::Texture, b"tile").unwrap();
+    store.put(ObjectKind::Texture, b"other tile").unwrap();
     for i in 0..3 {
         store.put(ObjectKind::Geometry, format!("geometry {i}").as_bytes()).unwrap();
         store.put(ObjectKind::Attributes, format!("attributes {i}").as_bytes()).unwrap();
@@ -114,6 +117,8 @@ fn broken_manifests_are_refused_with_a_reason() {
         |m| m.splits[1].hi[2] = 1.5,
         |m| m.splits[1].attributes = ObjectRef { bytes: 1, ..m.splits[0].attributes },
         |m| m.splits[1].geometry.bytes = 1 << 50,
+        |m| m.tiles[1].bytes = 1,
+        |m| m.tiles[2].bytes = 1 << 50,
         |m| m.grid.lo[0] = -2.0,
         |m| m.grid.cells[0].owners[0] = 3,
         |m| m.grid.cells[0].owners.push(2),

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use std::time::UNIX_EPOCH;
 
 use crate::ImportError;
-use crate::description::{Description, Environment, Geometry};
+use crate::description::{Description, Environment, Geometry, TextureKind};
 use crate::objects::ObjectHash;
 
 /// Fingerprint of a source: the hash of its description and, for every file it names (for a folder: every file in
@@ -23,18 +23,19 @@ pub fn fingerprint(description: &Description) -> Result<ObjectHash, ImportError>
         path: PathBuf::new(),
         message: format!("the description cannot be written down: {e}"),
     })?);
-    let mut files: BTreeSet<&Path> = description
-        .shapes
-        .iter()
-        .filter_map(|shape| match &shape.geometry {
-            Geometry::MeshFile { path, .. } | Geometry::IsoSurface { path, .. } => Some(path.as_path()),
-            Geometry::Inline { .. } | Geometry::Sphere { .. } => None,
-        })
-        .collect();
-    if let Some(Environment::Map { path, .. }) = &description.environment {
-        files.insert(path);
-    }
-    for file in files {
+    let shapes = description.shapes.iter().filter_map(|shape| match &shape.geometry {
+        Geometry::MeshFile { path, .. } | Geometry::IsoSurface { path, .. } => Some(path.as_path()),
+        Geometry::Inline { .. } | Geometry::Sphere { .. } => None,
+    });
+    let textures = description.textures.iter().filter_map(|texture| match &texture.kind {
+        TextureKind::Image { path, .. } => Some(path.as_path()),
+        TextureKind::Checkerboard(_) => None,
+    });
+    let sky = match &description.environment {
+        Some(Environment::Map { path, .. }) => Some(path.as_path()),
+        _ => None,
+    };
+    for file in shapes.chain(textures).chain(sky).collect::<BTreeSet<&Path>>() {
         add(&mut hasher, file, true)?;
     }
     Ok(ObjectHash(*hasher.finalize().as_bytes()))

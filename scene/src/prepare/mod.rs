@@ -3,6 +3,7 @@
 //! 1. *Bounds*: the source is read for its f64 bounds, unless importing has found them. Their centre becomes the origin.
 //! 2. *Reading*: the source is read once more (at most twice in all). Records are recentred, rounded to f32, checked, and put in a
 //!    spool: in memory while they are few, else in a temporary file.
+//!    Textures are read one after the other and stored as tiles.
 //! 3. *Counting*: now the number of splits is known. All candidate grids are counted in one pass over the spool.
 //! 4. *Building*: per split, what lies in which cell of the chosen grid; its tree and attributes are built and stored; primitives of
 //!    cells that are copied are dealt to groups.
@@ -26,6 +27,7 @@ mod settings;
 mod spool;
 #[cfg(test)]
 mod tests;
+mod textures;
 
 use std::io;
 use std::ops::Range;
@@ -33,6 +35,7 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use rayherd_render::bvh::BuildError;
+use rayherd_render::texture::Texture;
 use rayherd_render::world::{Beam, Environment, ShapeInfo, World};
 use rayon::prelude::*;
 
@@ -154,13 +157,16 @@ pub fn prepare(
 
     // 1, 2
     let (offset, mut ingested) = read(description, source, spool, progress)?;
-    let world = world(description, &offset, &mut ingested)?;
+    let textures = textures::store(&description.textures, &store)?;
+    ingested.counts.source_bytes += textures.bytes_read;
+    let tiles = textures.tiles;
+    let world = world(description, &offset, &mut ingested, textures.textures)?;
     let world_bytes = serde_json::to_vec(&world).map_err(|e| PrepareError::Inconsistent(e.to_string()))?;
     let sky_map = match import::sky_map(description.environment.as_ref())? {
         Some(map) => Some(store.put(ObjectKind::Texture, &map.encode())?),
         None => None,
     };
-    let content = content_hash(&offset, &ingested.hash, &world_bytes, sky_map.as_ref());
+    let content = content_hash(&offset, &ingested.hash, &world_bytes, sky_map.as_ref(), &tiles);
     let inner = ingested.inner();
     let Ingested { spool, counts, lo, hi, .. } = ingested;
     let spool_error = |source| PrepareError::Spool { folder: spool.folder().clone(), source };
@@ -219,6 +225,7 @@ pub fn prepare(
         hi,
         world,
         sky_map,
+        tiles,
         splits,
         grid,
         choice,
@@ -259,7 +266,12 @@ fn read(
     Ok((offset, ingested))
 }
 
-fn world(description: &Description, offset: &[f64; 3], ingested: &mut Ingested) -> Result<World, PrepareError> {
+fn world(
+    description: &Description,
+    offset: &[f64; 3],
+    ingested: &mut Ingested,
+    textures: Vec<Texture>,
+) -> Result<World, PrepareError> {
     let materials = description.materials.len();
     if let Some(shape) = description.shapes.iter().find(|s| s.material as usize >= materials) {
         let message = format!("shape {:?} has material {} of {materials}", shape.name, shape.material);
@@ -270,8 +282,9 @@ fn world(description: &Description, offset: &[f64; 3], ingested: &mut Ingested) 
         material: s.material,
         emission: s.emission,
     });
-    Ok(World {
+    let world = World {
         materials: description.materials.clone(),
+        textures,
         shapes: shapes.collect(),
         emissive: std::mem::take(&mut ingested.emissive),
         beams: description.beams.iter().map(|b| beam(b, offset)).collect(),
@@ -283,7 +296,9 @@ fn world(description: &Description, offset: &[f64; 3], ingested: &mut Ingested) 
         }),
         lo: ingested.lo,
         hi: ingested.hi,
-    })
+    };
+    world.check().map_err(PrepareError::Inconsistent)?;
+    Ok(world)
 }
 
 /// A beam in recentred f32.
@@ -306,16 +321,24 @@ fn beam(beam: &description::Beam, offset: &[f64; 3]) -> Beam {
     }
 }
 
-fn content_hash(offset: &[f64; 3], records: &blake3::Hash, world: &[u8], sky_map: Option<&ObjectRef>) -> ObjectHash {
+fn content_hash(
+    offset: &[f64; 3],
+    records: &blake3::Hash,
+    world: &[u8],
+    sky_map: Option<&ObjectRef>,
+    tiles: &[ObjectRef],
+) -> ObjectHash {
     let mut hasher = blake3::Hasher::new();
     hasher.update(b"rayherd content\0").update(&FORMAT.to_le_bytes());
     for x in offset {
         hasher.update(&x.to_le_bytes());
     }
-    hasher.update(records.as_bytes()).update(world);
-    if let Some(map) = sky_map {
-        hasher.update(&map.hash.0);
+    hasher.update(records.as_bytes());
+    // the world says how many there are, and whether there is a picture of the sky
+    for object in sky_map.into_iter().chain(tiles) {
+        hasher.update(&object.hash.0);
     }
+    hasher.update(world);
     ObjectHash(*hasher.finalize().as_bytes())
 }
 

@@ -53,7 +53,7 @@ pub enum ByteKind {
     Geometry,
     /// Attribute objects.
     Attributes,
-    /// The picture of the sky.
+    /// Tiles of textures and the picture of the sky.
     Texture,
 }
 

@@ -58,11 +58,7 @@ fn description(name: &str) -> Description {
     };
     Description {
         shapes: vec![shape(format!("{name} dark"), None), shape(format!("{name} light"), Some([1.0, 2.0, 3.0]))],
-        materials: vec![Material {
-            name: "grey".to_owned(),
-            bsdf: Bsdf::Diffuse { reflectance: [0.5; 3] },
-            two_sided: true,
-        }],
+        materials: vec![Material::new("grey", Bsdf::Diffuse { reflectance: [0.5; 3] }, true)],
         ..Default::default()
     }
 }

@@ -196,7 +196,7 @@ impl Heap {
         let n = self.spheres.len();
         let material = |i: usize| {
             let bsdf = Bsdf::Diffuse { reflectance: albedo(i) };
-            Material { name: String::new(), bsdf, two_sided: true }
+            Material::new("", bsdf, true)
         };
         let shape =
             |i: usize| ShapeInfo { name: String::new(), material: i as u32, emission: (i == 1).then_some([20.0; 3]) };
@@ -208,6 +208,7 @@ impl Heap {
             environment: Some(Environment::Constant([0.5; 3])),
             lo: [-1001.0; 3],
             hi: [1001.0; 3],
+            ..World::default()
         }
     }
 
@@ -247,7 +248,7 @@ fn real_rays(albedo: impl Fn(usize) -> [f32; 3]) -> Flights {
     let (frame, heap) = (frame(), Heap::new());
     let world = heap.world(albedo);
     let lights = Lights::new(&world);
-    let context = Context { world: &world, lights: &lights, frame: &frame };
+    let context = Context::new(&world, &lights, &frame);
     let mut rays: Vec<PathRay> = Vec::new();
     for pixel in 0..SIZE[0] * SIZE[1] {
         rays.extend((0..16).map(|sample| camera_ray(&frame, pixel, sample)));

@@ -9,10 +9,11 @@ use crate::camera::Camera;
 use crate::filter::Filter;
 use crate::frame::Frame;
 use crate::light::{Lights, SkyMap};
-use crate::material::{Bsdf, Material};
+use crate::material::{Bsdf, Detail, Material, Slot, Textured};
 use crate::path::reference::Tracer;
 use crate::path::{Surface, Surfaces};
 use crate::ray::{Hit, MISS, PrimId, Ray};
+use crate::texture::{Bitmap, Filter as TexelFilter, Texel, Texture, Tiles, UvMap, Wrap};
 use crate::world::{Beam, EmissivePrimitive, Environment, Primitive, ShapeInfo, World};
 
 /// A scene in a list.
@@ -26,12 +27,42 @@ pub struct Scene {
     pub environment: Option<[f32; 3]>,
     /// In place of `environment`: a picture, and rows of the rotation to it.
     pub sky_map: Option<(Arc<SkyMap>, [[f32; 3]; 3])>,
+    pub textures: Vec<Texture>,
+    pub tiles: Tiles,
 }
 
 impl Scene {
     pub fn material(&mut self, bsdf: Bsdf, two_sided: bool) -> u32 {
-        self.materials.push(Material { name: String::new(), bsdf, two_sided });
+        self.materials.push(Material::new("", bsdf, two_sided));
         self.materials.len() as u32 - 1
+    }
+
+    /// A material with detail.
+    pub fn detailed(&mut self, bsdf: Bsdf, detail: Detail) -> u32 {
+        let n = self.material(bsdf, true);
+        self.materials[n as usize].detail = Some(Box::new(detail));
+        n
+    }
+
+    /// A diffuse material whose albedo a texture gives.
+    pub fn painted(&mut self, texture: u32) -> u32 {
+        let textured = vec![Textured { slot: Slot::Diffuse, texture }];
+        self.detailed(Bsdf::Diffuse { reflectance: [0.0; 3] }, Detail { textured, ..Detail::default() })
+    }
+
+    /// An image of bytes as they are, 3 channels, of one tile.
+    pub fn image(&mut self, size: [u32; 2], bytes: Vec<u8>) -> u32 {
+        let first_tile = self.tiles.push(bytes);
+        self.textures.push(Texture::Bitmap(Bitmap {
+            size,
+            channels: 3,
+            texel: Texel::Linear8,
+            wrap: Wrap::Repeat,
+            filter: TexelFilter::Bilinear,
+            to_uv: UvMap::IDENTITY,
+            first_tile,
+        }));
+        self.textures.len() as u32 - 1
     }
 
     pub fn diffuse(&mut self, albedo: f32) -> u32 {
@@ -74,6 +105,7 @@ impl Scene {
         }
         World {
             materials: self.materials.clone(),
+            textures: self.textures.clone(),
             shapes: self.shapes.clone(),
             emissive,
             beams: self.beams.clone(),
@@ -191,4 +223,10 @@ pub fn frame(eye: [f64; 3], fov: f64, size: [u32; 2], max_depth: u32) -> Frame {
         split: 1,
         hide_emitters: false,
     }
+}
+
+/// The same, looking along -z.
+pub fn frame_back(eye: [f64; 3], fov: f64, size: [u32; 2], max_depth: u32) -> Frame {
+    let rows = [[-1.0, 0.0, 0.0, eye[0]], [0.0, 1.0, 0.0, eye[1]], [0.0, 0.0, -1.0, eye[2]]];
+    Frame { camera: Camera::new(&rows, fov, size, [0.0; 3]).unwrap(), ..frame(eye, fov, size, max_depth) }
 }

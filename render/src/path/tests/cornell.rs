@@ -75,7 +75,7 @@ fn mean_is_mitsubas() {
     let (scene, frame) = (scene(), frame(64));
     let world = scene.world();
     let lights = Lights::new(&world);
-    let context = Context { world: &world, lights: &lights, frame: &frame };
+    let context = Context::new(&world, &lights, &frame).with(&scene.tiles);
     let mut film = FilmPart::new(frame.size);
     let samples = 64;
     let counters = reference::render(&context, &scene, 0..samples, &mut film);

@@ -5,6 +5,7 @@ mod cornell;
 mod direct;
 mod furnace;
 mod step;
+mod textured;
 
 use brute::Scene;
 
@@ -16,7 +17,7 @@ use crate::frame::Frame;
 fn mean_of(scene: &Scene, frame: &Frame, samples: u32) -> f64 {
     let world = scene.world();
     let lights = scene.lights();
-    let context = Context { world: &world, lights: &lights, frame };
+    let context = Context::new(&world, &lights, frame).with(&scene.tiles);
     let mut film = FilmPart::new(frame.size);
     reference::render(&context, scene, 0..samples, &mut film);
     assert_eq!(film.rejected().count, 0);

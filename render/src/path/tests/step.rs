@@ -4,7 +4,7 @@ use glam::Vec3;
 
 use super::brute::{Scene, frame};
 use super::furnace::box_inside;
-use super::{cornell, mean_of};
+use super::{cornell, mean_of, textured};
 use crate::film::FilmPart;
 use crate::filter::Filter;
 use crate::frame::Frame;
@@ -21,7 +21,7 @@ use crate::world::Beam;
 fn channel_means(scene: &Scene, lights: Option<&Lights>, frame: &Frame, samples: u32) -> ([f64; 3], f64) {
     let world = scene.world();
     let own = Lights::new(&world);
-    let context = Context { world: &world, lights: lights.unwrap_or(&own), frame };
+    let context = Context::new(&world, lights.unwrap_or(&own), frame).with(&scene.tiles);
     let mut film = FilmPart::new(frame.size);
     reference::render(&context, scene, 0..samples, &mut film);
     let picture = film.resolve(samples);
@@ -93,6 +93,7 @@ fn motley() -> Scene {
     scene.shapes[count - 2].material = scene.material(bsdf, true);
     let mirror = Bsdf::Conductor { eta: [0.2; 3], k: [3.0; 3], specular: [1.0; 3] };
     scene.shapes[count - 3].material = scene.material(mirror, true);
+    textured::furnish(&mut scene);
     let white = scene.diffuse(0.8);
     let lamp = scene.shape(white, Some([2.0; 3]));
     scene.sphere(lamp, [0.5, 0.2, 0.3], 0.1, false);
@@ -114,7 +115,7 @@ fn check_batches(scene: &Scene, split: u32) {
     let frame = Frame { split, ..cornell::frame(16) };
     let world = scene.world();
     let lights = Lights::new(&world);
-    let context = Context { world: &world, lights: &lights, frame: &frame };
+    let context = Context::new(&world, &lights, &frame).with(&scene.tiles);
     let mut rays: Vec<PathRay> = (0..256).map(|p| camera_ray(&frame, p, 3)).collect();
     for _ in 0..4 {
         let hits: Vec<Hit> = rays.iter().map(|r| scene.closest(&r.ray())).collect();
@@ -177,7 +178,7 @@ fn depth_is_the_number_of_rays() {
     let lights = Lights::new(&world);
     for max_depth in 1..5 {
         let frame = Frame { max_depth, ..cornell::frame(16) };
-        let context = Context { world: &world, lights: &lights, frame: &frame };
+        let context = Context::new(&world, &lights, &frame).with(&scene.tiles);
         let mut rays: Vec<PathRay> = (0..256).map(|p| camera_ray(&frame, p, 0)).collect();
         for depth in 1..=max_depth {
             let hits: Vec<Hit> = rays.iter().map(|r| scene.closest(&r.ray())).collect();
@@ -230,7 +231,7 @@ fn surfaces_do_not_shade_themselves() {
         let world = scene.world();
         let lights = Lights::new(&world);
         let frame = frame([0.0; 3], 45.0, [1, 1], 3);
-        let context = Context { world: &world, lights: &lights, frame: &frame };
+        let context = Context::new(&world, &lights, &frame).with(&scene.tiles);
         let mut ray = camera_ray(&frame, 0, i as u32);
         let mut o = target + rng.direction() * size * [0.1, 3.0, 50.0][i / 9 % 3];
         if i % 2 == 0 {
@@ -336,7 +337,7 @@ fn nothing_is_nan() {
         let world = scene.world();
         let lights = Lights::new(&world);
         let frame = Frame { rr_depth: 2, split: 1 + rng.u32() % 2, ..frame([0.0; 3], 45.0, [8, 8], 10) };
-        let context = Context { world: &world, lights: &lights, frame: &frame };
+        let context = Context::new(&world, &lights, &frame).with(&scene.tiles);
         let mut out = Outcome::default();
         for _ in 0..20 {
             let (vertex, place) = ((rng.u32() % 9) as u16, sizes[(rng.u32() % 5) as usize]);

@@ -1,13 +1,16 @@
 //! Materials.
 
 use super::Converter;
-use super::xml::{ObjectId, Property, Value, malformed};
+use super::xml::{ObjectId, Value, malformed};
 use crate::ImportError;
-use crate::description::{Bsdf, Distribution, Material, Place};
+use crate::description::{Amount, Bsdf, Detail, Distribution, Material, Place, Relief, ReliefKind, Slot, Textured};
 use crate::import::metals;
 
 /// Mitsuba's stand-in where a shape names no material, and ours for unsupported ones.
 const DEFAULT_REFLECTANCE: f32 = 0.5;
+
+/// What textures give of a model under construction.
+pub(super) type Textures = Vec<Textured>;
 
 impl Converter<'_> {
     /// Number of the material of an object; made once.
@@ -15,9 +18,9 @@ impl Converter<'_> {
         if let Some(&n) = self.materials.get(&id) {
             return Ok(n);
         }
-        let (bsdf, two_sided) = self.bsdf(id, from)?;
-        let name = self.document.objects[id].id.clone().unwrap_or_else(|| bsdf_name(&bsdf).into());
-        let n = self.push_material(Material { name, bsdf, two_sided });
+        let mut material = self.bsdf(id, from)?;
+        material.name = self.document.objects[id].id.clone().unwrap_or_else(|| bsdf_name(&material.bsdf).into());
+        let n = self.push_material(material);
         self.materials.insert(id, n);
         Ok(n)
     }
@@ -26,7 +29,7 @@ impl Converter<'_> {
     pub(super) fn default_material(&mut self, emits: bool) -> u32 {
         let reflectance = if emits { [0.0; 3] } else { [DEFAULT_REFLECTANCE; 3] };
         let name = if emits { "default-emitter" } else { "default" };
-        let material = Material { name: name.into(), bsdf: Bsdf::Diffuse { reflectance }, two_sided: false };
+        let material = Material::new(name, Bsdf::Diffuse { reflectance }, false);
         match self.out.materials.iter().position(|m| *m == material) {
             Some(n) => n as u32,
             None => self.push_material(material),
@@ -38,74 +41,195 @@ impl Converter<'_> {
         self.out.materials.len() as u32 - 1
     }
 
-    fn bsdf(&mut self, id: ObjectId, from: &Place) -> Result<(Bsdf, bool), ImportError> {
+    /// A material without a name.
+    fn bsdf(&mut self, id: ObjectId, from: &Place) -> Result<Material, ImportError> {
         self.enter(id, from)?;
         let object = &self.document.objects[id];
         let place = &object.place;
-        let out = match object.plugin.as_str() {
-            "twosided" => {
-                let inner = self.nested(id, "bsdf")?;
-                match inner[..] {
-                    [(p, inner)] => (self.bsdf(inner, &p.place)?.0, true),
-                    [(p, front), (_, _back)] => {
-                        self.unsupported(place, "twosided with two materials", "its front on both sides");
-                        (self.bsdf(front, &p.place)?.0, true)
-                    }
-                    _ => return malformed(place, "twosided needs one or two materials inside"),
-                }
-            }
+        let mut textured = Textures::new();
+        let one_sided = |bsdf: Bsdf| Material::new("", bsdf, false);
+        let mut out = match object.plugin.as_str() {
+            "twosided" => self.two_sided(id)?,
+            "mask" => self.mask(id)?,
+            plugin @ ("bumpmap" | "normalmap") => self.relief(id, plugin)?,
             "diffuse" => {
-                let reflectance = match self.albedo(id, "reflectance")? {
+                let reflectance = match self.paint(id, "reflectance", Slot::Diffuse, &mut textured)? {
                     Some(v) => v,
                     // the name in 0.5 and 0.6
-                    None => self.albedo(id, "diffuse_reflectance")?.unwrap_or([DEFAULT_REFLECTANCE; 3]),
+                    None => self
+                        .paint(id, "diffuse_reflectance", Slot::Diffuse, &mut textured)?
+                        .unwrap_or([DEFAULT_REFLECTANCE; 3]),
                 };
-                (Bsdf::Diffuse { reflectance }, false)
+                one_sided(Bsdf::Diffuse { reflectance })
             }
             "conductor" => {
                 let (eta, k) = self.index_of_refraction(id)?;
-                let specular = self.albedo(id, "specular_reflectance")?.unwrap_or([1.0; 3]);
-                (Bsdf::Conductor { eta, k, specular }, false)
+                let specular = self.paint(id, "specular_reflectance", Slot::Specular, &mut textured)?;
+                one_sided(Bsdf::Conductor { eta, k, specular: specular.unwrap_or([1.0; 3]) })
             }
             "roughconductor" => {
                 let (eta, k) = self.index_of_refraction(id)?;
-                let specular = self.albedo(id, "specular_reflectance")?.unwrap_or([1.0; 3]);
+                let specular = self.paint(id, "specular_reflectance", Slot::Specular, &mut textured)?;
                 let distribution = self.distribution(id)?;
-                let alpha = self.roughness(id)?;
+                let alpha = self.roughness(id, &mut textured)?;
                 // how Mitsuba samples the lobe; the estimate is the same
                 self.ignore(id, &["sample_visible"]);
-                (Bsdf::RoughConductor { distribution, alpha, eta, k, specular }, false)
+                let specular = specular.unwrap_or([1.0; 3]);
+                one_sided(Bsdf::RoughConductor { distribution, alpha, eta, k, specular })
             }
-            plugin @ ("dielectric" | "thindielectric" | "roughdielectric") => (self.transparent(id, plugin)?, false),
-            plugin @ ("plastic" | "roughplastic") => (self.plastic(id, plugin)?, false),
-            plugin @ ("bumpmap" | "normalmap" | "mask" | "opacity") => {
-                self.unsupported(place, format!("bsdf \"{plugin}\""), "the material inside");
-                let inner = self.nested(id, "bsdf")?;
-                object.properties.iter().for_each(|p| p.used.set(true));
-                match inner[..] {
-                    [(p, inner), ..] => self.bsdf(inner, &p.place)?,
-                    [] => return malformed(place, format!("{plugin} needs a material inside")),
-                }
+            plugin @ ("dielectric" | "thindielectric" | "roughdielectric") => {
+                one_sided(self.transparent(id, plugin, &mut textured)?)
             }
+            plugin @ ("plastic" | "roughplastic") => one_sided(self.plastic(id, plugin, &mut textured)?),
             plugin @ ("roughdiffuse" | "phong" | "ward" | "principled") => {
                 self.unsupported(place, format!("bsdf \"{plugin}\""), "diffuse of its diffuse colour, two-sided");
+                let mut reflectance = None;
+                for name in ["diffuse_reflectance", "reflectance", "base_color"] {
+                    if reflectance.is_none() {
+                        reflectance = self.paint(id, name, Slot::Diffuse, &mut textured)?;
+                    }
+                }
                 object.properties.iter().for_each(|p| p.used.set(true));
-                let name =
-                    |p: &&Property| ["diffuse_reflectance", "reflectance", "base_color"].contains(&p.name.as_str());
-                let reflectance = match object.properties.iter().find(name).map(|p| &p.value) {
-                    Some(Value::Color(rgb)) => rgb.map(|v| v.clamp(0.0, 1.0) as f32),
-                    _ => [DEFAULT_REFLECTANCE; 3],
-                };
-                (Bsdf::Diffuse { reflectance }, true)
+                let reflectance = reflectance.unwrap_or([DEFAULT_REFLECTANCE; 3]);
+                Material::new("", Bsdf::Diffuse { reflectance }, true)
             }
             plugin => {
                 self.unsupported(place, format!("bsdf \"{plugin}\""), "grey diffuse, two-sided");
                 object.properties.iter().for_each(|p| p.used.set(true));
-                (Bsdf::Diffuse { reflectance: [DEFAULT_REFLECTANCE; 3] }, true)
+                Material::new("", Bsdf::Diffuse { reflectance: [DEFAULT_REFLECTANCE; 3] }, true)
             }
         };
         self.leave(id);
+        if !textured.is_empty() {
+            detail_of(&mut out).textured = textured;
+        }
         Ok(out)
+    }
+
+    fn two_sided(&mut self, id: ObjectId) -> Result<Material, ImportError> {
+        let place = &self.document.objects[id].place;
+        let inner = self.nested(id, "bsdf")?;
+        let (mut front, back) = match inner[..] {
+            [(p, inner)] => (self.bsdf(inner, &p.place)?, None),
+            [(p, front), (q, back)] => (self.bsdf(front, &p.place)?, Some((back, q))),
+            _ => return malformed(place, "twosided needs one or two materials inside"),
+        };
+        front.two_sided = true;
+        mirror_relief(&mut front);
+        if let Some((back, q)) = back {
+            let mut behind = self.bsdf(back, &q.place)?;
+            behind.two_sided = true;
+            behind.name = self.document.objects[back].id.clone().unwrap_or_else(|| bsdf_name(&behind.bsdf).into());
+            mirror_relief(&mut behind);
+            let nests = |m: &Material| m.detail.as_ref().is_some_and(|d| d.back.is_some());
+            let passes = |m: &Material| m.detail.as_ref().is_some_and(|d| d.opacity != Amount::Constant(1.0));
+            if nests(&front) || nests(&behind) || passes(&front) || passes(&behind) {
+                return malformed(place, "twosided with two materials takes no mask and no twosided inside");
+            }
+            let back = self.push_material(behind);
+            detail_of(&mut front).back = Some(back);
+        }
+        Ok(front)
+    }
+
+    fn mask(&mut self, id: ObjectId) -> Result<Material, ImportError> {
+        let place = &self.document.objects[id].place;
+        let opacity = match self.property(id, "opacity") {
+            None => Amount::Constant(0.5),
+            Some(p) => match self.texture_of(p, "opacity 1")? {
+                Some(number) => number.map_or(Amount::Constant(1.0), Amount::Texture),
+                None => {
+                    let [r, g, b] = self.color(id, "opacity", 1.0)?.unwrap_or([0.5; 3]);
+                    let opacity = if r == g && g == b { r } else { 0.2126 * r + 0.7152 * g + 0.0722 * b };
+                    if !(0.0..=1.0).contains(&opacity) {
+                        return malformed(&p.place, format!("opacity {opacity} should lie in [0, 1]"));
+                    }
+                    Amount::Constant(opacity as f32)
+                }
+            },
+        };
+        let mut inner = self.only_one_inside(id, "mask")?;
+        if let Some(detail) = &inner.detail
+            && detail.opacity != Amount::Constant(1.0)
+        {
+            self.unsupported(place, "mask around another mask", "the inner mask");
+        } else if opacity != Amount::Constant(1.0) {
+            detail_of(&mut inner).opacity = opacity;
+        }
+        Ok(inner)
+    }
+
+    fn relief(&mut self, id: ObjectId, plugin: &str) -> Result<Material, ImportError> {
+        let object = &self.document.objects[id];
+        let place = &object.place;
+        let mut inner = self.only_one_inside(id, plugin)?;
+        let kind = match plugin {
+            "normalmap" => ReliefKind::Normals,
+            _ => {
+                let scale = self.float(id, "scale")?.unwrap_or(1.0) as f32;
+                if !scale.is_finite() {
+                    return malformed(place, "the scale of a bumpmap is too large");
+                }
+                ReliefKind::Bump(scale)
+            }
+        };
+        let mut found = None;
+        for property in &object.properties {
+            if let Some(map) = self.document.object(property)?
+                && self.document.objects[map].class == "texture"
+            {
+                property.used.set(true);
+                if found.replace(property).is_some() {
+                    return malformed(&property.place, format!("a second texture in one {plugin}"));
+                }
+            }
+        }
+        let Some(property) = found else { return malformed(place, format!("{plugin} needs a texture inside")) };
+        let texture = match self.texture_of(property, "no relief")? {
+            Some(number) => number,
+            None => {
+                self.unsupported(&property.place, format!("this texture of {plugin}"), "no relief");
+                None
+            }
+        };
+        let Some(texture) = texture else { return Ok(inner) };
+        let relief = Relief { kind, texture, mirrored: false };
+        let back = inner.detail.as_ref().and_then(|d| d.back);
+        let twice = |m: &Material| m.detail.as_ref().is_some_and(|d| d.relief.is_some());
+        if twice(&inner) || back.is_some_and(|n| twice(&self.out.materials[n as usize])) {
+            self.unsupported(place, format!("{plugin} around another relief"), "the inner relief");
+            return Ok(inner);
+        }
+        detail_of(&mut inner).relief = Some(relief);
+        if let Some(n) = back {
+            detail_of(&mut self.out.materials[n as usize]).relief = Some(relief);
+        }
+        Ok(inner)
+    }
+
+    /// The one material inside an adapter.
+    fn only_one_inside(&mut self, id: ObjectId, plugin: &str) -> Result<Material, ImportError> {
+        match self.nested(id, "bsdf")?[..] {
+            [(p, inner)] => self.bsdf(inner, &p.place),
+            _ => malformed(&self.document.objects[id].place, format!("{plugin} needs one material inside")),
+        }
+    }
+
+    /// A colour in [0, 1], or a texture for a slot.
+    pub(super) fn paint(
+        &mut self,
+        id: ObjectId,
+        name: &str,
+        slot: Slot,
+        textured: &mut Textures,
+    ) -> Result<Option<[f32; 3]>, ImportError> {
+        if let Some(p) = self.property(id, name)
+            && let Some(number) = self.texture_of(p, "the grey 0.5")?
+        {
+            textured.extend(number.map(|texture| Textured { slot, texture }));
+            return Ok(Some([DEFAULT_REFLECTANCE; 3]));
+        }
+        self.albedo(id, name)
     }
 
     /// A colour in [0, 1].
@@ -165,10 +289,20 @@ impl Converter<'_> {
         }
     }
 
-    pub(super) fn roughness(&mut self, id: ObjectId) -> Result<[f32; 2], ImportError> {
+    /// Roughness along u and v; what textures give of it goes to `textured`.
+    pub(super) fn roughness(&mut self, id: ObjectId, textured: &mut Textures) -> Result<[f32; 2], ImportError> {
         let place = &self.document.objects[id].place;
-        let mut get = |name: &str| -> Result<Option<f64>, ImportError> { Ok(self.color(id, name, 0.1)?.map(|v| v[0])) };
-        let alpha = match (get("alpha")?, get("alpha_u")?, get("alpha_v")?) {
+        let mut get = |name: &str, slot| -> Result<Option<f64>, ImportError> {
+            if let Some(p) = self.property(id, name)
+                && let Some(number) = self.texture_of(p, "0.1")?
+            {
+                textured.extend(number.map(|texture| Textured { slot, texture }));
+                return Ok(Some(0.1));
+            }
+            Ok(self.color(id, name, 0.1)?.map(|v| v[0]))
+        };
+        let given = (get("alpha", Slot::Alpha)?, get("alpha_u", Slot::AlphaU)?, get("alpha_v", Slot::AlphaV)?);
+        let alpha = match given {
             (alpha, None, None) => [alpha.unwrap_or(0.1); 2],
             (None, Some(u), Some(v)) => [u, v],
             _ => return malformed(place, "give alpha, or both alpha_u and alpha_v"),
@@ -177,6 +311,18 @@ impl Converter<'_> {
             return malformed(place, format!("roughness {alpha:?} should lie in (0, 1]; use conductor for a mirror"));
         }
         Ok(alpha.map(|a| a as f32))
+    }
+}
+
+/// The detail of a material, which gets one.
+fn detail_of(material: &mut Material) -> &mut Detail {
+    material.detail.get_or_insert_default()
+}
+
+/// A relief inside of `twosided` is seen from behind as from the front.
+fn mirror_relief(material: &mut Material) {
+    if let Some(relief) = material.detail.as_mut().and_then(|d| d.relief.as_mut()) {
+        relief.mirrored = true;
     }
 }
 

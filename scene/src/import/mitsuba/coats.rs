@@ -1,9 +1,10 @@
 //! Transparent materials and plastics.
 
 use super::Converter;
+use super::bsdf::Textures;
 use super::xml::{ObjectId, Value, malformed};
 use crate::ImportError;
-use crate::description::{Bsdf, Transmittance};
+use crate::description::{Bsdf, Slot, Transmittance};
 use crate::import::refraction;
 
 /// Largest ratio of indices; diamond in vacuum has 2.4, and beyond 10 the reflectance of diffuse light is not known well enough.
@@ -11,15 +12,20 @@ const LARGEST: f64 = 10.0;
 
 impl Converter<'_> {
     /// `dielectric`, `thindielectric` and `roughdielectric`.
-    pub(super) fn transparent(&mut self, id: ObjectId, plugin: &str) -> Result<Bsdf, ImportError> {
+    pub(super) fn transparent(
+        &mut self,
+        id: ObjectId,
+        plugin: &str,
+        textured: &mut Textures,
+    ) -> Result<Bsdf, ImportError> {
         let eta = self.relative_index(id, "bk7")?;
-        let reflect = self.albedo(id, "specular_reflectance")?.unwrap_or([1.0; 3]);
-        let transmit = self.albedo(id, "specular_transmittance")?.unwrap_or([1.0; 3]);
+        let reflect = self.paint(id, "specular_reflectance", Slot::Specular, textured)?.unwrap_or([1.0; 3]);
+        let transmit = self.paint(id, "specular_transmittance", Slot::Transmit, textured)?.unwrap_or([1.0; 3]);
         Ok(match plugin {
             "thindielectric" => Bsdf::ThinDielectric { eta, reflect, transmit },
             // equal indices bend nothing, however rough
             "roughdielectric" if eta != 1.0 => {
-                let (distribution, alpha) = (self.distribution(id)?, self.roughness(id)?);
+                let (distribution, alpha) = (self.distribution(id)?, self.roughness(id, textured)?);
                 self.ignore(id, &["sample_visible"]);
                 Bsdf::RoughDielectric { distribution, alpha, eta, reflect, transmit }
             }
@@ -32,19 +38,24 @@ impl Converter<'_> {
     }
 
     /// `plastic` and `roughplastic`.
-    pub(super) fn plastic(&mut self, id: ObjectId, plugin: &str) -> Result<Bsdf, ImportError> {
+    pub(super) fn plastic(&mut self, id: ObjectId, plugin: &str, textured: &mut Textures) -> Result<Bsdf, ImportError> {
         let eta = self.relative_index(id, "polypropylene")?;
-        let diffuse = self.albedo(id, "diffuse_reflectance")?.unwrap_or([0.5; 3]);
-        let specular = self.albedo(id, "specular_reflectance")?.unwrap_or([1.0; 3]);
+        let diffuse = self.paint(id, "diffuse_reflectance", Slot::Diffuse, textured)?.unwrap_or([0.5; 3]);
+        let specular = self.paint(id, "specular_reflectance", Slot::Specular, textured)?.unwrap_or([1.0; 3]);
         let nonlinear = self.boolean(id, "nonlinear")?.unwrap_or(false);
         if plugin == "plastic" {
             return Ok(Bsdf::Plastic { eta, diffuse, specular, nonlinear });
         }
         let distribution = self.distribution(id)?;
-        let [alpha, other] = self.roughness(id)?;
+        let place = &self.document.objects[id].place;
+        let mut of_alpha = Textures::new();
+        let [alpha, other] = self.roughness(id, &mut of_alpha)?;
         if alpha != other {
-            let place = &self.document.objects[id].place;
             return malformed(place, "a rough plastic is isotropic: give alpha");
+        }
+        if !of_alpha.is_empty() {
+            // nor in Mitsuba
+            self.unsupported(place, "a texture for the alpha of a roughplastic", "0.1");
         }
         self.ignore(id, &["sample_visible"]);
         let coat = Transmittance::new(distribution, alpha, eta);

@@ -20,6 +20,7 @@ mod emitter;
 mod scene;
 mod sensor;
 mod shape;
+mod texture;
 mod transform;
 mod value;
 mod xml;
@@ -41,6 +42,7 @@ pub(super) fn import(path: &Path, options: &ImportOptions) -> Result<Description
         out: Description::default(),
         unsupported: vec![],
         materials: BTreeMap::new(),
+        textures: BTreeMap::new(),
         open: BTreeSet::new(),
     };
     for (place, what) in &document.unknown {
@@ -64,6 +66,8 @@ struct Converter<'a> {
     unsupported: Vec<(Place, String)>,
     /// Materials made so far, by object.
     materials: BTreeMap<ObjectId, u32>,
+    /// Textures made so far, by object; none for one that cannot be had.
+    textures: BTreeMap<ObjectId, Option<u32>>,
     /// Objects being converted, to find cycles of references.
     open: BTreeSet<ObjectId>,
 }
@@ -236,3 +240,5 @@ mod sensor_tests;
 mod shape_tests;
 #[cfg(test)]
 mod tests;
+#[cfg(test)]
+mod texture_tests;

@@ -322,7 +322,7 @@ fn all_that_is_unsupported_is_listed() {
     let text = "<integrator type=\"path\"><boolean name=\"hide_emitters\" value=\"true\"/></integrator>\n\
          <sensor type=\"fisheye\"/>\n\
          <bsdf type=\"ward\" id=\"p\"/>\n\
-         <bsdf type=\"diffuse\" id=\"d\"><texture name=\"reflectance\" type=\"bitmap\"/></bsdf>\n\
+         <bsdf type=\"diffuse\" id=\"d\"><texture name=\"reflectance\" type=\"marble\"/></bsdf>\n\
          <shape type=\"hair\"/>\n\
          <shape type=\"cube\"><ref id=\"p\"/><medium name=\"interior\" type=\"homogeneous\"/></shape>\n\
          <shape type=\"cube\"><ref id=\"d\"/>\n<float name=\"wobble\" value=\"1\"/></shape>\n\
@@ -336,7 +336,7 @@ fn all_that_is_unsupported_is_listed() {
         [
             (3, "sensor \"fisheye\""),
             (4, "bsdf \"ward\""),
-            (5, "texture \"bitmap\" for \"reflectance\""),
+            (5, "texture \"marble\" for \"reflectance\""),
             (6, "shape \"hair\""),
             (7, "medium \"homogeneous\" in shape \"cube\""),
             (9, "property \"wobble\" of shape \"cube\""),

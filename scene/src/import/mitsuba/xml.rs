@@ -114,14 +114,23 @@ impl Document {
         }
     }
 
-    /// A file that the scene names, relative to the file that names it; it must lie in the scene's folder.
+    /// Where a file that the scene names may be: relative to the file that names it, or to the scene.
+    fn path(&self, name: &str, place: &Place) -> PathBuf {
+        let beside = place.file.parent().unwrap_or(Path::new("")).join(name);
+        if beside.exists() { beside } else { self.folder.join(name) }
+    }
+
+    /// Whether there is a file of this name, wherever it lies.
+    pub fn exists(&self, name: &str, place: &Place) -> bool {
+        !name.contains('\0') && !name.is_empty() && self.path(name, place).exists()
+    }
+
+    /// A file that the scene names; it must lie in the scene's folder.
     pub fn resolve(&self, name: &str, place: &Place) -> Result<PathBuf, ImportError> {
         if name.contains('\0') || name.is_empty() {
             return malformed(place, format!("{name:?} is no file name"));
         }
-        let beside = place.file.parent().unwrap_or(Path::new("")).join(name);
-        let from_root = self.folder.join(name);
-        let path = if beside.exists() { beside } else { from_root };
+        let path = self.path(name, place);
         let Ok(canonical) = path.canonicalize() else {
             return malformed(place, format!("file \"{name}\" does not exist beside the scene"));
         };

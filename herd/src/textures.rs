@@ -1,0 +1,307 @@
+//! The texture tiles that a node holds in memory, and a task's way to them.
+//!
+//! Tiles are read when a look-up asks for them first. A node keeps what it read within a budget and drops what was used longest ago; a
+//! task keeps a few tiles of its own at hand, so that most look-ups ask nobody.
+
+use std::cell::{Ref, RefCell};
+use std::collections::{BTreeMap, BTreeSet};
+use std::sync::{Arc, Condvar, Mutex, PoisonError};
+
+use rayherd_render::texture::Textures;
+use rayherd_scene::objects::ObjectRef;
+
+use crate::job::{JobError, PreparedScene};
+
+/// Bytes of tiles that a node keeps unless told otherwise.
+pub const DEFAULT_BUDGET: u64 = 256 << 20;
+
+/// Most tiles that a task has at hand.
+const MOST_AT_HAND: u64 = 4096;
+
+/// Gives tiles to whoever loads them, and counts them.
+pub trait Tiles {
+    /// A tile's bytes, verified, by its number.
+    fn tile(&self, number: u32) -> Result<Vec<u8>, JobError>;
+    /// A tile was in the node's memory already.
+    fn warm(&self, number: u32);
+}
+
+/// Tiles straight from the scene's store, counted by nobody: for tools that look at one path.
+pub struct StoredTiles<'a>(pub &'a PreparedScene);
+
+impl Tiles for StoredTiles<'_> {
+    fn tile(&self, number: u32) -> Result<Vec<u8>, JobError> {
+        Ok(self.0.objects.get(tile_of(self.0, number)?)?)
+    }
+    fn warm(&self, _: u32) {}
+}
+
+/// The object of a tile.
+pub fn tile_of(scene: &PreparedScene, number: u32) -> Result<&ObjectRef, JobError> {
+    let missing = || JobError::Internal(format!("texture tile {number} was asked for"));
+    scene.manifest.tiles.get(number as usize).ok_or_else(missing)
+}
+
+/// Nodes that hold a copy of a tile: dealt in turn, as the tiles of a picture are read together.
+pub fn tile_holders(number: u32, nodes: u32, replicas: u32) -> Vec<u32> {
+    (0..replicas.min(nodes)).map(|k| (number % nodes + k) % nodes).collect()
+}
+
+/// A node's tiles.
+pub struct TileCache {
+    budget: u64,
+    state: Mutex<State>,
+    changed: Condvar,
+}
+
+#[derive(Default)]
+struct State {
+    held: BTreeMap<u32, Held>,
+    /// Tiles by when they were used last.
+    by_use: BTreeMap<u64, u32>,
+    loading: BTreeSet<u32>,
+    clock: u64,
+    bytes: u64,
+    peak: u64,
+}
+
+struct Held {
+    tile: Arc<[u8]>,
+    used_at: u64,
+}
+
+impl TileCache {
+    /// A cache of so many bytes. One tile for each task is held even when that is more.
+    pub fn new(budget: u64) -> Self {
+        TileCache { budget, state: Mutex::default(), changed: Condvar::new() }
+    }
+
+    /// The most bytes that it held at once.
+    pub fn peak(&self) -> u64 {
+        self.lock().peak
+    }
+
+    /// Forgets everything.
+    pub fn clear(&self) {
+        let mut state = self.lock();
+        state.held.clear();
+        state.by_use.clear();
+        state.bytes = 0;
+    }
+
+    fn lock(&self) -> std::sync::MutexGuard<'_, State> {
+        // nothing is changed half
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// A tile, read unless it is here. Several tasks that ask for one tile at once read it once.
+    ///
+    /// # Errors
+    /// When it cannot be read.
+    pub fn get(&self, number: u32, from: &dyn Tiles) -> Result<Arc<[u8]>, JobError> {
+        let mut state = self.lock();
+        loop {
+            if let Some(tile) = state.touch(number) {
+                drop(state);
+                from.warm(number);
+                return Ok(tile);
+            }
+            if state.loading.insert(number) {
+                break;
+            }
+            state = self.changed.wait(state).unwrap_or_else(PoisonError::into_inner);
+        }
+        drop(state);
+        // a load that fails (or panics) must not leave others waiting for it
+        struct Loading<'a>(&'a TileCache, u32);
+        impl Drop for Loading<'_> {
+            fn drop(&mut self) {
+                self.0.lock().loading.remove(&self.1);
+                self.0.changed.notify_all();
+            }
+        }
+        let loading = Loading(self, number);
+        let tile: Arc<[u8]> = from.tile(number)?.into();
+        self.lock().insert(number, tile.clone(), self.budget);
+        drop(loading);
+        Ok(tile)
+    }
+}
+
+impl State {
+    /// A tile that is held, now the last one used.
+    fn touch(&mut self, number: u32) -> Option<Arc<[u8]>> {
+        let held = self.held.get_mut(&number)?;
+        self.clock += 1;
+        self.by_use.remove(&held.used_at);
+        self.by_use.insert(self.clock, number);
+        held.used_at = self.clock;
+        Some(held.tile.clone())
+    }
+
+    fn insert(&mut self, number: u32, tile: Arc<[u8]>, budget: u64) {
+        let bytes = tile.len() as u64;
+        // what a task has at hand is in memory whether it is held here or not
+        let idle: Vec<(u64, u32)> = self
+            .by_use
+            .iter()
+            .filter(|(_, n)| self.held.get(n).is_some_and(|h| Arc::strong_count(&h.tile) == 1))
+            .map(|(&at, &n)| (at, n))
+            .take_while(|(_, n)| {
+                let over = self.bytes + bytes > budget;
+                if over {
+                    self.bytes -= self.held.get(n).map_or(0, |h| h.tile.len() as u64);
+                }
+                over
+            })
+            .collect();
+        for (at, n) in idle {
+            self.by_use.remove(&at);
+            self.held.remove(&n);
+        }
+        self.clock += 1;
+        self.by_use.insert(self.clock, number);
+        self.held.insert(number, Held { tile, used_at: self.clock });
+        self.bytes += bytes;
+        self.peak = self.peak.max(self.bytes);
+    }
+}
+
+/// A tile and its number.
+type AtHand = (u32, Arc<[u8]>);
+
+/// A task's textures: for one thread.
+pub struct TaskTextures<'a> {
+    cache: &'a TileCache,
+    from: &'a dyn Tiles,
+    /// Tiles by number modulo their count.
+    at_hand: RefCell<Vec<Option<AtHand>>>,
+    error: RefCell<Option<JobError>>,
+}
+
+impl<'a> TaskTextures<'a> {
+    /// Tiles of a scene through a node's cache, which so many tasks share.
+    pub fn new(scene: &PreparedScene, cache: &'a TileCache, from: &'a dyn Tiles, tasks: u32) -> Self {
+        let tiles = scene.manifest.tiles.len() as u64;
+        let largest = scene.manifest.tiles.iter().map(|t| t.bytes).max().unwrap_or(1).max(1);
+        // half of the budget, at most, is in tasks' hands: these tiles are not dropped
+        let share = cache.budget / 2 / largest / u64::from(tasks.max(1));
+        let count = share.clamp(1, MOST_AT_HAND).min(tiles.max(1));
+        let at_hand = RefCell::new(vec![None; count as usize]);
+        TaskTextures { cache, from, at_hand, error: RefCell::default() }
+    }
+
+    /// The error of the first tile that could not be had, once: what was shaded since does not count.
+    ///
+    /// # Errors
+    /// That one.
+    pub fn check(&self) -> Result<(), JobError> {
+        self.error.borrow_mut().take().map_or(Ok(()), Err)
+    }
+}
+
+impl Textures for TaskTextures<'_> {
+    #[inline]
+    fn tile(&self, number: u32) -> Option<Ref<'_, [u8]>> {
+        let tiles = self.at_hand.borrow();
+        let place = number as usize % tiles.len();
+        let found = Ref::filter_map(tiles, |tiles| match &tiles[place] {
+            Some((n, tile)) if *n == number => Some(&**tile),
+            _ => None,
+        });
+        match found {
+            Ok(tile) => Some(tile),
+            Err(tiles) => {
+                drop(tiles);
+                self.fetch(number, place)
+            }
+        }
+    }
+}
+
+impl TaskTextures<'_> {
+    #[cold]
+    fn fetch(&self, number: u32, place: usize) -> Option<Ref<'_, [u8]>> {
+        if self.error.borrow().is_some() {
+            // the task is over: nothing more is read for it
+            return None;
+        }
+        // what lay here is let go first, so that there is room
+        self.at_hand.borrow_mut()[place] = None;
+        match self.cache.get(number, self.from) {
+            Ok(tile) => self.at_hand.borrow_mut()[place] = Some((number, tile)),
+            Err(e) => {
+                self.error.replace(Some(e));
+                return None;
+            }
+        }
+        Ref::filter_map(self.at_hand.borrow(), |tiles| tiles[place].as_ref().map(|(_, tile)| &**tile)).ok()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::atomic::{AtomicU64, Ordering};
+
+    use super::*;
+
+    /// Tiles of 100 bytes of their number; 7 cannot be read.
+    #[derive(Default)]
+    struct Numbered {
+        read: AtomicU64,
+        warm: AtomicU64,
+    }
+
+    impl Tiles for Numbered {
+        fn tile(&self, number: u32) -> Result<Vec<u8>, JobError> {
+            self.read.fetch_add(1, Ordering::Relaxed);
+            if number == 7 { Err(JobError::Stopped) } else { Ok(vec![number as u8; 100]) }
+        }
+        fn warm(&self, _: u32) {
+            self.warm.fetch_add(1, Ordering::Relaxed);
+        }
+    }
+
+    #[test]
+    fn what_was_used_longest_ago_is_dropped() {
+        let cache = TileCache::new(300);
+        let from = Numbered::default();
+        let get = |n: u32| cache.get(n, &from).unwrap()[0];
+        for n in [1, 2, 3, 1, 4, 1, 3] {
+            assert_eq!(u32::from(get(n)), n);
+        }
+        // 2 made room for 4
+        assert_eq!((from.read.load(Ordering::Relaxed), from.warm.load(Ordering::Relaxed)), (4, 3));
+        get(2);
+        assert_eq!(from.read.load(Ordering::Relaxed), 5);
+        assert_eq!(cache.peak(), 300);
+        assert!(cache.get(7, &from).is_err());
+        assert!(cache.get(7, &from).is_err(), "and nobody waits for it");
+        // in a task's hands: not dropped, and counted
+        let held: Vec<_> = [1, 2, 3, 4].iter().map(|&n| cache.get(n, &from).unwrap()).collect();
+        assert_eq!(cache.peak(), 400);
+        drop(held);
+        get(5);
+        assert!(cache.lock().bytes <= 300);
+        cache.clear();
+        assert_eq!(cache.lock().bytes, 0);
+    }
+
+    #[test]
+    fn a_tile_is_read_once_for_all_who_ask() {
+        let cache = TileCache::new(1 << 20);
+        let from = Numbered::default();
+        std::thread::scope(|scope| {
+            for _ in 0..8 {
+                scope.spawn(|| (0..6).for_each(|n| assert_eq!(u32::from(cache.get(n, &from).unwrap()[0]), n)));
+            }
+        });
+        assert_eq!((from.read.load(Ordering::Relaxed), from.warm.load(Ordering::Relaxed)), (6, 42));
+    }
+
+    #[test]
+    fn holders_are_dealt_in_turn() {
+        assert_eq!([0, 1, 2, 3].map(|n| tile_holders(n, 3, 2)), [vec![0, 1], vec![1, 2], vec![2, 0], vec![0, 1]]);
+        assert_eq!(tile_holders(5, 1, 3), [0]);
+    }
+}

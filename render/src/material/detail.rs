@@ -1,0 +1,197 @@
+//! What varies over a surface: textures in the place of a material's constants, opacity, relief.
+//!
+//! A material without any of it has no detail and pays for none. Else a hit looks up what it needs and goes on with a plain [`Bsdf`].
+
+use serde::{Deserialize, Serialize};
+
+use super::{Bsdf, Material};
+use crate::texture::{Texture, Textures};
+
+/// A parameter of a [`Bsdf`] that a texture may give.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub enum Slot {
+    /// Albedo: of a diffuse surface, of a plastic's base.
+    Diffuse,
+    /// Factor on what is reflected by metal, glass or coat.
+    Specular,
+    /// Factor on what passes through glass.
+    Transmit,
+    /// Roughness along u and v.
+    Alpha,
+    /// Roughness along u.
+    AlphaU,
+    /// Roughness along v.
+    AlphaV,
+}
+
+/// A texture in the place of a parameter.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Textured {
+    /// Which parameter.
+    pub slot: Slot,
+    /// Index into [`crate::world::World::textures`].
+    pub texture: u32,
+}
+
+/// A number, or a texture that gives it.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub enum Amount {
+    /// The same everywhere.
+    Constant(f32),
+    /// Index into [`crate::world::World::textures`].
+    Texture(u32),
+}
+
+/// What turns the shading normal.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Relief {
+    /// How the texture says it.
+    pub kind: ReliefKind,
+    /// Index into [`crate::world::World::textures`].
+    pub texture: u32,
+    /// Seen from behind it is the mirror image of the front (`twosided` around it), not its other side (inside of it).
+    pub mirrored: bool,
+}
+
+/// How a texture says where the normal points.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub enum ReliefKind {
+    /// It is a height above the surface, times this.
+    Bump(f32),
+    /// Its colour c is the normal 2 c - 1 in the frame of dp/du and the shading normal.
+    Normals,
+}
+
+/// What a material has beside its model.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Detail {
+    /// Parameters that vary.
+    pub textured: Vec<Textured>,
+    /// Probability of meeting the material; else the ray passes as if there were nothing.
+    pub opacity: Amount,
+    /// What turns the shading normal.
+    pub relief: Option<Relief>,
+    /// Index into [`crate::world::World::materials`] of what the back side is made of, if it is something else.
+    pub back: Option<u32>,
+}
+
+impl Default for Detail {
+    /// Nothing.
+    fn default() -> Self {
+        Detail { textured: Vec::new(), opacity: Amount::Constant(1.0), relief: None, back: None }
+    }
+}
+
+impl Detail {
+    /// Whether it is textures in the place of parameters and nothing else.
+    #[inline(always)]
+    pub fn is_paint(&self) -> bool {
+        self.relief.is_none() && self.back.is_none() && self.opacity == Amount::Constant(1.0)
+    }
+
+    /// Every texture that it names.
+    pub fn textures(&self) -> impl Iterator<Item = u32> {
+        let opacity = match self.opacity {
+            Amount::Constant(_) => None,
+            Amount::Texture(n) => Some(n),
+        };
+        self.textured.iter().map(|t| t.texture).chain(opacity).chain(self.relief.map(|r| r.texture))
+    }
+}
+
+impl Amount {
+    /// Its value at texture coordinates, brought into [0, 1].
+    #[inline]
+    pub fn share(self, textures: &[Texture], tiles: &dyn Textures, uv: [f32; 2]) -> f32 {
+        match self {
+            Amount::Constant(x) => x,
+            Amount::Texture(n) => share(textures[n as usize].amount(tiles, uv)),
+        }
+    }
+}
+
+/// In [0, 1]; 0 for NaN.
+#[inline(always)]
+fn share(x: f32) -> f32 {
+    if x > 0.0 { x.min(1.0) } else { 0.0 }
+}
+
+impl Material {
+    /// The model at texture coordinates. Colours are brought into [0, 1] and roughness to at most 1.
+    #[inline(never)]
+    pub fn at(&self, detail: &Detail, textures: &[Texture], tiles: &dyn Textures, uv: [f32; 2]) -> Bsdf {
+        let mut bsdf = self.bsdf.clone();
+        for &Textured { slot, texture } in &detail.textured {
+            let texture = &textures[texture as usize];
+            match slot {
+                Slot::Diffuse | Slot::Specular | Slot::Transmit => {
+                    if let Some(place) = bsdf.color_mut(slot) {
+                        *place = texture.color(tiles, uv).to_array().map(share);
+                    }
+                }
+                Slot::Alpha | Slot::AlphaU | Slot::AlphaV => {
+                    if let Some(alpha) = bsdf.alpha_mut() {
+                        let value = share(texture.amount(tiles, uv));
+                        match slot {
+                            Slot::AlphaU => alpha[0] = value,
+                            Slot::AlphaV => alpha[1] = value,
+                            _ => *alpha = [value; 2],
+                        }
+                    }
+                }
+            }
+        }
+        bsdf
+    }
+
+    /// The albedo at texture coordinates, of a diffuse material.
+    #[inline]
+    pub fn albedo(
+        &self,
+        detail: &Detail,
+        textures: &[Texture],
+        tiles: &dyn Textures,
+        uv: [f32; 2],
+    ) -> Option<[f32; 3]> {
+        let Bsdf::Diffuse { reflectance } = self.bsdf else { return None };
+        let textured = detail.textured.iter().rev().find(|t| t.slot == Slot::Diffuse);
+        let color = |t: &Textured| textures[t.texture as usize].color(tiles, uv).to_array().map(share);
+        Some(textured.map_or(reflectance, color))
+    }
+}
+
+impl Bsdf {
+    /// The colour of a slot, where the model has it.
+    pub fn color_mut(&mut self, slot: Slot) -> Option<&mut [f32; 3]> {
+        match (self, slot) {
+            (Bsdf::Diffuse { reflectance: color }, Slot::Diffuse)
+            | (Bsdf::Plastic { diffuse: color, .. } | Bsdf::RoughPlastic { diffuse: color, .. }, Slot::Diffuse)
+            | (Bsdf::Plastic { specular: color, .. } | Bsdf::RoughPlastic { specular: color, .. }, Slot::Specular)
+            | (
+                Bsdf::Conductor { specular: color, .. } | Bsdf::RoughConductor { specular: color, .. },
+                Slot::Specular,
+            )
+            | (
+                Bsdf::Dielectric { reflect: color, .. }
+                | Bsdf::ThinDielectric { reflect: color, .. }
+                | Bsdf::RoughDielectric { reflect: color, .. },
+                Slot::Specular,
+            )
+            | (
+                Bsdf::Dielectric { transmit: color, .. }
+                | Bsdf::ThinDielectric { transmit: color, .. }
+                | Bsdf::RoughDielectric { transmit: color, .. },
+                Slot::Transmit,
+            ) => Some(color),
+            _ => None,
+        }
+    }
+
+    /// The roughness, where a texture may give it.
+    pub fn alpha_mut(&mut self) -> Option<&mut [f32; 2]> {
+        match self {
+            Bsdf::RoughConductor { alpha, .. } | Bsdf::RoughDielectric { alpha, .. } => Some(alpha),
+            _ => None,
+        }
+    }
+}

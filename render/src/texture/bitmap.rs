@@ -1,0 +1,179 @@
+//! Images.
+
+use glam::Vec3;
+use serde::{Deserialize, Serialize};
+
+use super::UvMap;
+use super::texel::Texel;
+use super::tiles::{TILE, Textures};
+use crate::math::luminance;
+
+/// What is beyond the image.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub enum Wrap {
+    /// The image again.
+    Repeat,
+    /// The image again, every other one turned round.
+    Mirror,
+    /// Its edge.
+    Clamp,
+}
+
+/// What is between texels.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub enum Filter {
+    /// The four nearest ones, weighted.
+    Bilinear,
+    /// The nearest one.
+    Nearest,
+}
+
+/// An image: row 0 begins at v = 0.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Bitmap {
+    /// Width and height in texels, each from 1 to [`Bitmap::MOST`].
+    pub size: [u32; 2],
+    /// 1 or 3.
+    pub channels: u8,
+    /// Of one channel.
+    pub texel: Texel,
+    /// Beyond the image.
+    pub wrap: Wrap,
+    /// Between texels.
+    pub filter: Filter,
+    /// Texture coordinates to those of the image, whose corners are (0, 0) and (1, 1).
+    pub to_uv: UvMap,
+    /// Number of its first tile among those of all textures of the world; the others follow, row by row.
+    pub first_tile: u32,
+}
+
+impl Bitmap {
+    /// Largest width and height: texel numbers fit f32.
+    pub const MOST: u32 = 1 << 16;
+
+    /// Tiles in a row, and rows of tiles.
+    #[inline(always)]
+    pub fn tiles_each_way(&self) -> [u32; 2] {
+        self.size.map(|n| n.div_ceil(TILE))
+    }
+
+    /// Numbers of its tiles.
+    pub fn tiles(&self) -> std::ops::Range<u32> {
+        let [x, y] = self.tiles_each_way();
+        self.first_tile..self.first_tile.saturating_add(x.saturating_mul(y))
+    }
+
+    /// Width and height of the tile at a place in the grid of tiles.
+    #[inline(always)]
+    pub fn tile_size(&self, at: [u32; 2]) -> [u32; 2] {
+        std::array::from_fn(|a| TILE.min(self.size[a] - at[a] * TILE))
+    }
+
+    /// Bytes of a texel.
+    #[inline(always)]
+    pub fn texel_bytes(&self) -> usize {
+        usize::from(self.channels) * self.texel.bytes()
+    }
+
+    /// Bytes of one of its tiles, by its number in the world.
+    pub fn tile_bytes(&self, number: u32) -> u64 {
+        let n = number - self.first_tile;
+        let across = self.tiles_each_way()[0];
+        let [w, h] = self.tile_size([n % across, n / across]);
+        u64::from(w) * u64::from(h) * self.texel_bytes() as u64
+    }
+
+    /// The colour at texture coordinates.
+    #[inline]
+    pub fn color(&self, tiles: &dyn Textures, uv: [f32; 2]) -> Vec3 {
+        match self.filter {
+            Filter::Nearest => {
+                let at = self.place(uv, 0.0);
+                let [x, y] = std::array::from_fn(|a| self.wrapped(at[a].floor() as i32, a));
+                self.four(tiles, [x, x], [y, y])[0]
+            }
+            Filter::Bilinear => {
+                let ([v00, v10, v01, v11], [s, t]) = self.around(tiles, uv);
+                let v0 = v00 * (1.0 - s) + v10 * s;
+                let v1 = v01 * (1.0 - s) + v11 * s;
+                v0 * (1.0 - t) + v1 * t
+            }
+        }
+    }
+
+    /// One number for a colour of this image.
+    #[inline(always)]
+    pub(super) fn amount(&self, color: Vec3) -> f32 {
+        if self.channels == 1 { color.x } else { luminance(color) }
+    }
+
+    /// Derivatives of the number by u and v; 0 unless bilinear. At a texel's centre those on its right.
+    pub fn gradient(&self, tiles: &dyn Textures, uv: [f32; 2]) -> [f32; 2] {
+        if self.filter == Filter::Nearest {
+            return [0.0; 2];
+        }
+        let (texels, [s, t]) = self.around(tiles, uv);
+        let [f00, f10, f01, f11] = texels.map(|c| self.amount(c));
+        let along = [(1.0 - t) * (f10 - f00) + t * (f11 - f01), (1.0 - s) * (f01 - f00) + s * (f11 - f10)];
+        let [x, y] = [along[0] * self.size[0] as f32, along[1] * self.size[1] as f32];
+        let m = &self.to_uv.0;
+        [m[0][0] * x + m[1][0] * y, m[0][1] * x + m[1][1] * y]
+    }
+
+    /// Texture coordinates in texels, less `shift`. Where nothing is left of the fraction (2^24 texels from the image, NaN): 0.
+    #[inline(always)]
+    fn place(&self, uv: [f32; 2], shift: f32) -> [f32; 2] {
+        let at = self.to_uv.point(uv);
+        std::array::from_fn(|a| {
+            let x = at[a] * self.size[a] as f32 - shift;
+            if x.abs() < 16_777_216.0 { x } else { 0.0 }
+        })
+    }
+
+    /// The four texels around a point, and the weights of the right and the lower ones.
+    #[inline(always)]
+    fn around(&self, tiles: &dyn Textures, uv: [f32; 2]) -> ([Vec3; 4], [f32; 2]) {
+        let at = self.place(uv, 0.5);
+        let corner = at.map(f32::floor);
+        let [x, y] = std::array::from_fn(|a| {
+            let i = corner[a] as i32;
+            [self.wrapped(i, a), self.wrapped(i + 1, a)]
+        });
+        (self.four(tiles, x, y), [at[0] - corner[0], at[1] - corner[1]])
+    }
+
+    /// The texel that stands for number `i` along an axis.
+    #[inline(always)]
+    fn wrapped(&self, i: i32, axis: usize) -> u32 {
+        let n = self.size[axis] as i32;
+        if (0..n).contains(&i) {
+            return i as u32;
+        }
+        let inside = match self.wrap {
+            Wrap::Repeat => i.rem_euclid(n),
+            Wrap::Mirror => {
+                let k = i.rem_euclid(2 * n);
+                if k < n { k } else { 2 * n - 1 - k }
+            }
+            Wrap::Clamp => i.clamp(0, n - 1),
+        };
+        inside as u32
+    }
+
+    /// The texels of two columns and two rows, row by row.
+    #[inline(always)]
+    fn four(&self, tiles: &dyn Textures, x: [u32; 2], y: [u32; 2]) -> [Vec3; 4] {
+        let across = self.tiles_each_way()[0];
+        let at = [[x[0], y[0]], [x[1], y[0]], [x[0], y[1]], [x[1], y[1]]];
+        let read = |texels: &[u8], [x, y]: [u32; 2]| {
+            let [w, _] = self.tile_size([x / TILE, y / TILE]);
+            let n = (y % TILE) * w + x % TILE;
+            self.texel.read(self.channels, texels, n as usize * self.texel_bytes())
+        };
+        let tile = |[x, y]: [u32; 2]| tiles.tile(self.first_tile + (y / TILE) * across + x / TILE);
+        if x[0] / TILE == x[1] / TILE && y[0] / TILE == y[1] / TILE {
+            return tile(at[0]).map_or([Vec3::ZERO; 4], |texels| at.map(|p| read(&texels, p)));
+        }
+        at.map(|p| tile(p).map_or(Vec3::ZERO, |texels| read(&texels, p)))
+    }
+}

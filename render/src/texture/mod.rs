@@ -1,0 +1,86 @@
+//! Textures: values that vary over a surface with its texture coordinates.
+//!
+//! The description ([`Texture`]) is part of the world. A bitmap's texels lie in tiles of [`TILE`] x [`TILE`], which whoever renders hands
+//! out ([`Textures`]) and reads on demand. What a look-up gives is Mitsuba 3's: texel centres at (i + 0.5) / n, row 0 at v = 0, sRGB decoded
+//! before filtering.
+
+mod bitmap;
+mod checkerboard;
+#[cfg(test)]
+mod tests;
+mod texel;
+mod tiles;
+
+use glam::Vec3;
+use serde::{Deserialize, Serialize};
+
+use crate::math::luminance;
+
+pub use bitmap::{Bitmap, Filter, Wrap};
+pub use checkerboard::Checkerboard;
+#[cfg(test)]
+pub(crate) use tests::Tiles;
+pub use texel::{Texel, decode_srgb};
+pub use tiles::{NoTextures, TILE, Textures};
+
+/// An affine map of texture coordinates, rows of a 2 x 3 matrix: `u' = m[0][0] u + m[0][1] v + m[0][2]`.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct UvMap(pub [[f32; 3]; 2]);
+
+impl UvMap {
+    /// The map that changes nothing.
+    pub const IDENTITY: UvMap = UvMap([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]);
+
+    /// Image of a point.
+    #[inline(always)]
+    pub fn point(&self, [u, v]: [f32; 2]) -> [f32; 2] {
+        self.0.map(|row| row[0] * u + row[1] * v + row[2])
+    }
+}
+
+/// A texture. It is no function of anything but (u, v).
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub enum Texture {
+    /// An image.
+    Bitmap(Bitmap),
+    /// Squares of two colours.
+    Checkerboard(Checkerboard),
+}
+
+impl Texture {
+    /// The colour at texture coordinates, linear Rec. 709; a grey image's value in all channels. 0 where a tile cannot be had.
+    #[inline]
+    pub fn color(&self, tiles: &dyn Textures, uv: [f32; 2]) -> Vec3 {
+        match self {
+            Texture::Bitmap(bitmap) => bitmap.color(tiles, uv),
+            Texture::Checkerboard(checkerboard) => checkerboard.color(uv),
+        }
+    }
+
+    /// One number at texture coordinates: a grey image's value, the luminance of a colour. Of a checkerboard the number of the *other* square, as
+    /// Mitsuba has it.
+    #[inline]
+    pub fn amount(&self, tiles: &dyn Textures, uv: [f32; 2]) -> f32 {
+        match self {
+            Texture::Bitmap(bitmap) => bitmap.amount(bitmap.color(tiles, uv)),
+            Texture::Checkerboard(checkerboard) => luminance(checkerboard.other(uv)),
+        }
+    }
+
+    /// Derivatives of the number by u and v, of a bilinear image; 0 of everything else, which has steps only.
+    #[inline]
+    pub fn gradient(&self, tiles: &dyn Textures, uv: [f32; 2]) -> [f32; 2] {
+        match self {
+            Texture::Bitmap(bitmap) => bitmap.gradient(tiles, uv),
+            Texture::Checkerboard(_) => [0.0; 2],
+        }
+    }
+
+    /// Its first tile and how many it has.
+    pub fn tiles(&self) -> std::ops::Range<u32> {
+        match self {
+            Texture::Bitmap(bitmap) => bitmap.tiles(),
+            Texture::Checkerboard(_) => 0..0,
+        }
+    }
+}

@@ -1,0 +1,122 @@
+//! Textures.
+
+use super::Converter;
+use super::xml::{ObjectId, Property, malformed};
+use crate::ImportError;
+use crate::description::{Affine, Checkerboard, TexelFilter, Texture, TextureKind, UvMap, Wrap};
+use crate::image;
+
+impl Converter<'_> {
+    /// Number of the texture that a property holds or refers to; `None` when it is no texture of ours.
+    ///
+    /// A texture that is not supported, or whose file is missing or no image, is noted, and `Some(None)`.
+    pub(super) fn texture_of(
+        &mut self,
+        property: &Property,
+        stand_in: &str,
+    ) -> Result<Option<Option<u32>>, ImportError> {
+        let Some(id) = self.document.object(property)? else { return Ok(None) };
+        let object = &self.document.objects[id];
+        match (object.class.as_str(), object.plugin.as_str()) {
+            ("texture", "bitmap" | "checkerboard") => {}
+            _ => return Ok(None),
+        }
+        if let Some(&known) = self.textures.get(&id) {
+            return Ok(Some(known));
+        }
+        self.enter(id, &property.place)?;
+        let kind = if object.plugin == "bitmap" { self.bitmap(id, stand_in)? } else { self.checkerboard(id)? };
+        self.leave(id);
+        let number = kind.map(|kind| {
+            // the same file, looked at the same way, is one texture
+            let same = self.out.textures.iter().position(|t| t.kind == kind);
+            same.unwrap_or_else(|| {
+                self.out.textures.push(Texture { place: object.place.clone(), kind });
+                self.out.textures.len() - 1
+            }) as u32
+        });
+        self.textures.insert(id, number);
+        Ok(Some(number))
+    }
+
+    fn bitmap(&mut self, id: ObjectId, stand_in: &str) -> Result<Option<TextureKind>, ImportError> {
+        let place = &self.document.objects[id].place;
+        // how Mitsuba keeps texels in memory, and 0.6 filtered them
+        self.ignore(id, &["format", "accel", "cache", "max_anisotropy"]);
+        let raw = match self.gamma(id)? {
+            Some(linear) => linear,
+            None => self.boolean(id, "raw")?.unwrap_or(false),
+        };
+        let filter = match self.string(id, "filter_type")? {
+            None | Some(("bilinear", _)) => TexelFilter::Bilinear,
+            Some(("nearest", _)) => TexelFilter::Nearest,
+            Some((name, at)) => {
+                self.unsupported(at, format!("filter_type \"{name}\""), "bilinear");
+                TexelFilter::Bilinear
+            }
+        };
+        let wrap = match self.string(id, "wrap_mode")? {
+            None | Some(("repeat", _)) => Wrap::Repeat,
+            Some(("mirror", _)) => Wrap::Mirror,
+            Some(("clamp", _)) => Wrap::Clamp,
+            Some((name, at)) => {
+                self.unsupported(at, format!("wrap_mode \"{name}\""), "repeat");
+                Wrap::Repeat
+            }
+        };
+        let to_uv = self.uv_map(id)?;
+        let Some((name, at)) = self.string(id, "filename")? else {
+            return malformed(place, "a bitmap lacks its filename");
+        };
+        // a file that is missing or no image is one of many, perhaps: all are listed
+        if !self.document.exists(name, at) {
+            self.unsupported(at, format!("texture file \"{name}\" (there is no such file)"), stand_in);
+            return Ok(None);
+        }
+        let path = self.document.resolve(name, at)?;
+        if let Err(why) = image::header(&path, raw) {
+            self.unsupported(at, format!("texture file \"{name}\" (it {why})"), stand_in);
+            return Ok(None);
+        }
+        Ok(Some(TextureKind::Image { path, raw, wrap, filter, to_uv }))
+    }
+
+    /// 0.6: an exponent of 1 is linear, -1 is sRGB.
+    fn gamma(&mut self, id: ObjectId) -> Result<Option<bool>, ImportError> {
+        match self.float(id, "gamma")? {
+            None => Ok(None),
+            Some(1.0) => Ok(Some(true)),
+            Some(-1.0) => Ok(Some(false)),
+            Some(gamma) => {
+                let place = &self.document.objects[id].place;
+                self.unsupported(place, format!("gamma {gamma} of a bitmap"), "sRGB");
+                Ok(Some(false))
+            }
+        }
+    }
+
+    fn checkerboard(&mut self, id: ObjectId) -> Result<Option<TextureKind>, ImportError> {
+        let first = self.albedo(id, "color0")?.unwrap_or([0.4; 3]);
+        let second = self.albedo(id, "color1")?.unwrap_or([0.2; 3]);
+        Ok(Some(TextureKind::Checkerboard(Checkerboard { to_uv: self.uv_map(id)?, colors: [first, second] })))
+    }
+
+    /// `to_uv`: x and y of a map in space. In 0.5 and 0.6 offsets and scales, which Mitsuba 3 reads as: first the offset, then the scale.
+    fn uv_map(&self, id: ObjectId) -> Result<UvMap, ImportError> {
+        let old = |name: &str| self.float(id, name);
+        let offset = [old("uoffset")?, old("voffset")?];
+        let scale = [old("uscale")?, old("vscale")?];
+        let map = if offset.iter().chain(&scale).any(Option::is_some) {
+            let [du, dv] = offset.map(|x| x.unwrap_or(0.0));
+            let [su, sv] = scale.map(|x| x.unwrap_or(1.0));
+            Affine([[su, 0.0, 0.0, su * du], [0.0, sv, 0.0, sv * dv], [0.0, 0.0, 1.0, 0.0]])
+        } else {
+            self.transform(id, "to_uv")?
+        };
+        let rows = [0, 1].map(|r| [map.0[r][0], map.0[r][1], map.0[r][3]].map(|x| x as f32));
+        if rows.iter().flatten().any(|x| !x.is_finite()) {
+            return malformed(&self.document.objects[id].place, "to_uv is too large for floating point");
+        }
+        Ok(UvMap(rows))
+    }
+}

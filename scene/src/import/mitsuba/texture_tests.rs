@@ -1,0 +1,211 @@
+//! Textures in XML, and the materials around them.
+
+use std::path::Path;
+
+use crate::ImportError;
+use crate::description::{
+    Amount, Bsdf, Description, Detail, Material, Relief, ReliefKind, Slot, TexelFilter, Texture, TextureKind, Textured,
+    UvMap, Wrap,
+};
+use crate::import::tests::folder;
+use crate::import::{ImportOptions, import};
+
+/// A scene of these elements beside a picture `a.hdr`, with a sky.
+fn scene_with(inside: &str, substitute: bool) -> Result<Description, ImportError> {
+    let folder = folder();
+    let text = format!("<scene version=\"0.6.0\">\n{inside}\n</scene>");
+    std::fs::write(folder.path().join("s.xml"), text).unwrap();
+    std::fs::write(
+        folder.path().join("a.hdr"),
+        "#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 1 +X 1\n\u{1}\u{2}\u{3}\u{4}",
+    )
+    .unwrap();
+    std::fs::write(folder.path().join("b.png"), "no picture").unwrap();
+    let options = ImportOptions { sky: Some([1.0; 3]), substitute, ..ImportOptions::default() };
+    import(&folder.path().join("s.xml"), &options)
+}
+
+fn scene(inside: &str) -> Description {
+    scene_with(inside, false).unwrap()
+}
+
+/// A shape of a material.
+fn shape(bsdf: &str) -> String {
+    format!("<shape type=\"cube\">{bsdf}</shape>")
+}
+
+fn bitmap(name: &str, more: &str) -> String {
+    format!("<texture type=\"bitmap\" name=\"{name}\"><string name=\"filename\" value=\"a.hdr\"/>{more}</texture>")
+}
+
+fn detail(material: &Material) -> &Detail {
+    material.detail.as_deref().unwrap()
+}
+
+fn textured(slot: Slot, texture: u32) -> Textured {
+    Textured { slot, texture }
+}
+
+#[test]
+fn bitmaps_in_both_spellings() {
+    let kind = |more: &str| {
+        let out = scene(&shape(&format!("<bsdf type=\"diffuse\">{}</bsdf>", bitmap("reflectance", more))));
+        assert_eq!(detail(&out.materials[0]).textured, [textured(Slot::Diffuse, 0)]);
+        assert!(detail(&out.materials[0]).is_paint());
+        let [Texture { kind: TextureKind::Image { path, raw, wrap, filter, to_uv }, place }] = &out.textures[..] else {
+            panic!("{:?}", out.textures)
+        };
+        assert_eq!((path.file_name(), place.line), (Some("a.hdr".as_ref()), 2));
+        (*raw, *wrap, *filter, *to_uv)
+    };
+    assert_eq!(kind(""), (false, Wrap::Repeat, TexelFilter::Bilinear, UvMap::IDENTITY));
+    let new = "<boolean name=\"raw\" value=\"true\"/><string name=\"wrap_mode\" value=\"mirror\"/>\
+        <string name=\"filter_type\" value=\"nearest\"/><transform name=\"to_uv\"><translate x=\"0.1\" y=\"0.2\"/>\
+        <rotate z=\"1\" angle=\"30\"/><scale x=\"3\" y=\"5\"/></transform>";
+    let (raw, wrap, filter, UvMap(map)) = kind(new);
+    assert_eq!((raw, wrap, filter), (true, Wrap::Mirror, TexelFilter::Nearest));
+    // Mitsuba 3.9.1's matrix for this
+    let expected = [[2.598_08, -1.5, -0.040_192_4], [2.5, 4.330_13, 1.116_03]];
+    for (found, expected) in map.iter().flatten().zip(expected.iter().flatten()) {
+        assert!((f64::from(*found) - expected).abs() < 1e-5, "{map:?}");
+    }
+    let old = "<float name=\"gamma\" value=\"1\"/><string name=\"wrapMode\" value=\"clamp\"/>\
+        <string name=\"filterType\" value=\"nearest\"/><float name=\"uscale\" value=\"3\"/>\
+        <float name=\"vscale\" value=\"5\"/><float name=\"uoffset\" value=\"0.1\"/><float name=\"voffset\" value=\"0.2\"/>";
+    let (raw, wrap, filter, UvMap(map)) = kind(old);
+    assert_eq!((raw, wrap, filter), (true, Wrap::Clamp, TexelFilter::Nearest));
+    assert_eq!(map, [[3.0, 0.0, 0.3], [0.0, 5.0, 1.0]].map(|row| row.map(|x: f64| x as f32)));
+}
+
+#[test]
+fn every_parameter_that_takes_one() {
+    let t = |name| bitmap(name, "");
+    for (bsdf, slots) in [
+        (format!("<bsdf type=\"conductor\">{}", t("specularReflectance")), vec![Slot::Specular]),
+        (
+            format!("<bsdf type=\"roughconductor\">{}{}", t("specular_reflectance"), t("alpha")),
+            vec![Slot::Specular, Slot::Alpha],
+        ),
+        (
+            format!("<bsdf type=\"roughconductor\">{}<float name=\"alpha_v\" value=\"0.3\"/>", t("alpha_u")),
+            vec![Slot::AlphaU],
+        ),
+        (
+            format!("<bsdf type=\"dielectric\">{}{}", t("specular_reflectance"), t("specular_transmittance")),
+            vec![Slot::Specular, Slot::Transmit],
+        ),
+        (format!("<bsdf type=\"roughdielectric\">{}", t("alpha")), vec![Slot::Alpha]),
+        (
+            format!("<bsdf type=\"plastic\">{}{}", t("diffuse_reflectance"), t("specular_reflectance")),
+            vec![Slot::Diffuse, Slot::Specular],
+        ),
+        (format!("<bsdf type=\"roughplastic\">{}", t("diffuseReflectance")), vec![Slot::Diffuse]),
+    ] {
+        let out = scene(&shape(&format!("{bsdf}</bsdf>")));
+        // one file looked at one way is one texture
+        assert_eq!(out.textures.len(), 1, "{bsdf}");
+        let expected: Vec<Textured> = slots.into_iter().map(|s| textured(s, 0)).collect();
+        assert_eq!(detail(&out.materials[0]).textured, expected, "{bsdf}");
+        let mut model = out.materials[0].bsdf.clone();
+        for t in expected {
+            let there = match t.slot {
+                Slot::Diffuse | Slot::Specular | Slot::Transmit => model.color_mut(t.slot).is_some(),
+                _ => model.alpha_mut().is_some(),
+            };
+            assert!(there, "{model:?} has no {:?}", t.slot);
+        }
+    }
+    let named = format!(
+        "{}<bsdf type=\"diffuse\" id=\"m\"><ref name=\"reflectance\" id=\"t\"/></bsdf>{}",
+        bitmap("", "").replace("<texture", "<texture id=\"t\""),
+        shape("<ref id=\"m\"/>")
+    );
+    assert_eq!(detail(&scene(&named).materials[0]).textured, [textured(Slot::Diffuse, 0)]);
+    let squares = "<bsdf type=\"diffuse\"><texture type=\"checkerboard\" name=\"reflectance\">\
+        <rgb name=\"color0\" value=\"1, 0, 0\"/><transform name=\"to_uv\"><scale x=\"4\" y=\"2\"/></transform></texture></bsdf>";
+    let out = scene(&shape(squares));
+    let TextureKind::Checkerboard(c) = &out.textures[0].kind else { panic!("{:?}", out.textures) };
+    assert_eq!((c.colors, c.to_uv.0[0]), ([[1.0, 0.0, 0.0], [0.2; 3]], [4.0, 0.0, 0.0]));
+}
+
+#[test]
+fn masks_reliefs_and_two_sides() {
+    let grey = "<bsdf type=\"diffuse\"/>";
+    let mask = |inside: &str| scene(&shape(&format!("<bsdf type=\"mask\">{inside}</bsdf>")));
+    assert_eq!(detail(&mask(grey).materials[0]).opacity, Amount::Constant(0.5));
+    let quarter = format!("<float name=\"opacity\" value=\"0.25\"/>{grey}");
+    assert_eq!(detail(&mask(&quarter).materials[0]).opacity, Amount::Constant(0.25));
+    // opaque: nothing to look up
+    assert!(mask(&format!("<float name=\"opacity\" value=\"1\"/>{grey}")).materials[0].detail.is_none());
+    let leaf = mask(&format!(
+        "{}<bsdf type=\"twosided\"><bsdf type=\"diffuse\">{}</bsdf></bsdf>",
+        bitmap("opacity", ""),
+        bitmap("reflectance", "")
+    ));
+    assert!(leaf.materials[0].two_sided);
+    assert_eq!(detail(&leaf.materials[0]).opacity, Amount::Texture(0));
+    assert_eq!(detail(&leaf.materials[0]).textured, [textured(Slot::Diffuse, 0)]);
+
+    let bump = |inside: &str| {
+        format!("<bsdf type=\"bumpmap\">{}<float name=\"scale\" value=\"2\"/>{inside}</bsdf>", bitmap("map", ""))
+    };
+    let two = |inside: &str| format!("<bsdf type=\"twosided\">{inside}</bsdf>");
+    let relief = |mirrored| Some(Relief { kind: ReliefKind::Bump(2.0), texture: 0, mirrored });
+    assert_eq!(detail(&scene(&shape(&bump(&two(grey)))).materials[0]).relief, relief(false));
+    assert_eq!(detail(&scene(&shape(&two(&bump(grey)))).materials[0]).relief, relief(true));
+    let normals = format!(
+        "<bsdf type=\"normalmap\">{}{grey}</bsdf>",
+        bitmap("normalmap", "<boolean name=\"raw\" value=\"true\"/>")
+    );
+    assert_eq!(detail(&scene(&shape(&normals)).materials[0]).relief.unwrap().kind, ReliefKind::Normals);
+
+    // both sides get the relief around them
+    let plastic = format!("<bsdf type=\"plastic\">{}</bsdf>", bitmap("diffuse_reflectance", ""));
+    let out = scene(&shape(&bump(&two(&format!("{grey}{plastic}")))));
+    let front = out.materials.iter().find(|m| m.detail.as_ref().is_some_and(|d| d.back.is_some())).unwrap();
+    let back = &out.materials[detail(front).back.unwrap() as usize];
+    assert!(matches!(back.bsdf, Bsdf::Plastic { .. }) && back.two_sided && front.two_sided);
+    assert_eq!((detail(front).relief, detail(back).relief), (relief(false), relief(false)));
+}
+
+#[test]
+fn what_is_missing_or_wrong_is_listed() {
+    let file = |name: &str| {
+        format!(
+            "<bsdf type=\"diffuse\"><texture type=\"bitmap\" name=\"reflectance\">\n<string name=\"filename\" value=\"{name}\"/></texture></bsdf>"
+        )
+    };
+    let text = format!("{}\n{}\n{}", shape(&file("gone.png")), shape(&file("b.png")), shape(&file("lost.jpg")));
+    let Err(ImportError::Unsupported(list)) = scene_with(&text, false) else { panic!("no list") };
+    let got: Vec<(u32, &str)> = list.iter().map(|(p, what)| (p.line, what.as_str())).collect();
+    assert_eq!(got.len(), 3, "{got:?}");
+    assert!(got[0].0 == 3 && got[0].1.contains("\"gone.png\" (there is no such file)"), "{got:?}");
+    assert!(got[1].0 == 5 && got[1].1.contains("\"b.png\" (it is no PNG"), "{got:?}");
+    assert!(got[2].0 == 7 && got[2].1.contains("lost.jpg"), "{got:?}");
+    // with a stand-in: grey
+    let out = scene_with(&text, true).unwrap();
+    assert_eq!(out.materials[0].bsdf, Bsdf::Diffuse { reflectance: [0.5; 3] });
+    assert!(out.materials[0].detail.is_none() && out.textures.is_empty() && out.substitutions.len() == 3);
+
+    let message = |bsdf: &str| scene_with(&shape(bsdf), false).unwrap_err().to_string();
+    let grey = "<bsdf type=\"diffuse\"/>";
+    for (bsdf, what) in [
+        (format!("<bsdf type=\"diffuse\">{}</bsdf>", bitmap("reflectance", "<string name=\"wrap_mode\" value=\"zero\"/>")), "wrap_mode \"zero\""),
+        (format!("<bsdf type=\"diffuse\">{}</bsdf>", bitmap("reflectance", "<string name=\"filter_type\" value=\"ewa\"/>")), "filter_type \"ewa\""),
+        (format!("<bsdf type=\"diffuse\">{}</bsdf>", bitmap("reflectance", "<float name=\"gamma\" value=\"2\"/>")), "gamma 2"),
+        ("<bsdf type=\"diffuse\"><texture type=\"bitmap\" name=\"reflectance\"/></bsdf>".into(), "lacks its filename"),
+        ("<bsdf type=\"diffuse\"><texture type=\"bitmap\" name=\"reflectance\"><string name=\"filename\" value=\"../../etc/passwd\"/></texture></bsdf>".into(), "etc/passwd"),
+        (format!("<bsdf type=\"roughplastic\">{}</bsdf>", bitmap("alpha", "")), "alpha of a roughplastic"),
+        (format!("<bsdf type=\"mask\"><float name=\"opacity\" value=\"1.5\"/>{grey}</bsdf>"), "[0, 1]"),
+        ("<bsdf type=\"mask\"/>".into(), "one material inside"),
+        (format!("<bsdf type=\"bumpmap\">{grey}</bsdf>"), "needs a texture"),
+        (format!("<bsdf type=\"bumpmap\">{}{}{grey}</bsdf>", bitmap("a", ""), bitmap("b", "")), "second texture"),
+        (format!("<bsdf type=\"bumpmap\">{}<bsdf type=\"bumpmap\">{}{grey}</bsdf></bsdf>", bitmap("a", ""), bitmap("b", "")), "around another relief"),
+        (format!("<bsdf type=\"mask\"><bsdf type=\"mask\">{grey}</bsdf></bsdf>"), "around another mask"),
+        (format!("<bsdf type=\"twosided\"><bsdf type=\"mask\">{grey}</bsdf>{grey}</bsdf>"), "takes no mask"),
+    ] {
+        let error = message(&bsdf);
+        assert!(error.contains(what) && error.contains("s.xml:2"), "{bsdf}: {error}");
+    }
+    assert!(!Path::new("a.hdr").exists());
+}
