@@ -87,7 +87,7 @@ fn check_memory([width, height]: [u32; 2]) -> Result<(), Mistake> {
 }
 
 /// Bytes of memory, where the system tells.
-fn memory_of_machine() -> Option<u64> {
+pub fn memory_of_machine() -> Option<u64> {
     let text = std::fs::read_to_string(Path::new("/proc/meminfo")).ok()?;
     let line = text.lines().find(|l| l.starts_with("MemTotal:"))?;
     line.split_whitespace().nth(1)?.parse::<u64>().ok().map(|kib| kib * 1024)

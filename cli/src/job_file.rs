@@ -4,12 +4,16 @@ use std::path::{Path, PathBuf};
 
 use rayherd_api::RenderJob;
 
+use crate::bounded;
 use crate::fault::Mistake;
+
+/// Most bytes of a job file: it holds settings, and thousands of cameras at most.
+const MOST_BYTES: u64 = 4 << 20;
 
 /// Reads a job file. A relative source is relative to the file.
 pub fn read_job(path: &Path) -> anyhow::Result<RenderJob> {
-    let text = std::fs::read_to_string(path).map_err(|e| Mistake(format!("cannot read {}: {e}", path.display())))?;
-    let mut job: RenderJob = serde_yaml::from_str(&text).map_err(|e| Mistake(format!("{}: {e}", path.display())))?;
+    let text = bounded::read(path, MOST_BYTES, "this is no job file")?;
+    let mut job: RenderJob = serde_yaml::from_slice(&text).map_err(|e| Mistake(format!("{}: {e}", path.display())))?;
     let source = PathBuf::from(&job.spec.scene.source);
     if source.is_relative() && !job.spec.scene.source.is_empty() && !job.spec.scene.source.contains("://") {
         let beside = path.parent().unwrap_or(Path::new("")).join(source);

@@ -1,5 +1,6 @@
 //! `rayherd`: renders, prepares, compares, replays.
 
+mod bounded;
 mod commands;
 mod fault;
 mod frames;

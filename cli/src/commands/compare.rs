@@ -1,7 +1,8 @@
 //! `rayherd compare`: how much two pictures differ.
 
 use std::collections::BTreeMap;
-use std::fs;
+use std::fs::File;
+use std::io::{BufRead, BufReader};
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
@@ -163,8 +164,18 @@ fn check_same_shape(a: &Channels, b: &Channels, arguments: &Arguments) -> Result
 }
 
 fn same_bytes(a: &Path, b: &Path) -> anyhow::Result<bool> {
-    let read = |p: &Path| fs::read(p).with_context(|| format!("cannot read {}", p.display()));
-    Ok(read(a)? == read(b)?)
+    let open = |p: &Path| File::open(p).map(BufReader::new).with_context(|| format!("cannot read {}", p.display()));
+    let (mut one, mut other) = (open(a)?, open(b)?);
+    loop {
+        let failed = || format!("cannot read {} and {} again", a.display(), b.display());
+        let (x, y) = (one.fill_buf().with_context(failed)?, other.fill_buf().with_context(failed)?);
+        let n = x.len().min(y.len());
+        if n == 0 || x[..n] != y[..n] {
+            return Ok(x.is_empty() && y.is_empty());
+        }
+        one.consume(n);
+        other.consume(n);
+    }
 }
 
 /// Relative differences as grey levels of the sRGB curve; the first channels named R, G and B, or else one for all.

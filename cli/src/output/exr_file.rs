@@ -1,13 +1,14 @@
 //! OpenEXR in: any flat scanline or tiled picture. Out: [`rayherd_herd::picture`].
 
 use std::collections::BTreeMap;
-use std::fs;
 use std::io::Cursor;
 use std::path::Path;
 
 use exr::prelude::{FlatImage, FlatSamples, MetaData, ReadChannels, ReadLayers};
 
+use crate::bounded;
 use crate::fault::{self, Mistake};
+use crate::frames::memory_of_machine;
 
 /// The channels of an EXR file by name (`LAYER.NAME` when there are layers), as f32, rows from the top.
 pub struct Channels {
@@ -23,17 +24,29 @@ pub struct Channels {
 /// about the size, found before memory is taken.
 const MOST_EXPANSION: u64 = 1100;
 
+/// Part of the machine's memory that one picture may take, as a file and as floats: two are compared, each once as it is stored and
+/// once as it is read.
+const SHARE: u64 = 4;
+
 /// Reads every channel of a file's first size level. Layers must have one size.
+///
+/// # Errors
+/// What is no EXR file, is damaged, or needs more memory than there is, told before it is taken.
 pub fn read(path: &Path) -> anyhow::Result<Channels> {
     let mistake = |why: String| Mistake(format!("{}: {why}", path.display()));
-    let bytes = fs::read(path).map_err(|e| Mistake(format!("cannot read {}: {e}", path.display())))?;
+    // it is read twice, and a pipe can only be read once
+    if std::fs::metadata(path).is_ok_and(|m| !m.is_file()) {
+        return Err(mistake("is no regular file: name an EXR picture".into()).into());
+    }
+    let most = memory_of_machine().unwrap_or(u64::MAX - 1) / SHARE;
+    let bytes = bounded::read(path, most, "this machine has not the memory to compare such pictures, take another one")?;
     // the decoder panics on some damaged files (compression B44, in 1.74)
     let image =
-        fault::of_others(|| decode(&bytes)).unwrap_or_else(|what| Err(format!("cannot be read as EXR: {what}")));
+        fault::of_others(|| decode(&bytes, most)).unwrap_or_else(|what| Err(format!("cannot be read as EXR: {what}")));
     image.and_then(collect).map_err(|e| mistake(e).into())
 }
 
-fn decode(bytes: &[u8]) -> Result<FlatImage, String> {
+fn decode(bytes: &[u8], most: u64) -> Result<FlatImage, String> {
     let meta = MetaData::read_from_buffered(Cursor::new(bytes), false).map_err(|e| format!("is no EXR file: {e}"))?;
     let mut claimed = 0u128;
     for header in &meta.headers {
@@ -48,6 +61,9 @@ fn decode(bytes: &[u8]) -> Result<FlatImage, String> {
     }
     if claimed > bytes.len() as u128 * u128::from(MOST_EXPANSION) {
         return Err(format!("is damaged: its header claims {claimed} bytes of pixels in a file of {}", bytes.len()));
+    }
+    if claimed > u128::from(most) {
+        return Err(format!("holds {claimed} bytes of pixels, this machine can take {most}: compare them on a larger one"));
     }
     exr::prelude::read()
         .no_deep_data()
@@ -96,6 +112,7 @@ mod tests {
     use rayherd_herd::picture::{ATTRIBUTE, encode};
     use rayherd_tests::mutation;
     use serde_json::{Map, Value};
+    use std::fs;
 
     use super::*;
 
@@ -148,6 +165,15 @@ mod tests {
         fs::write(&path, huge).unwrap();
         let error = read(&path).err().unwrap().to_string();
         assert!(error.contains("a.exr"), "{error}");
+    }
+
+    #[test]
+    fn memory_is_asked_before_it_is_taken() {
+        let bytes = encode(&picture(), &definition()).unwrap();
+        let pixels = 70 * 40 * 3 * 4;
+        assert!(decode(&bytes, pixels).is_ok());
+        let error = decode(&bytes, pixels - 1).err().unwrap();
+        assert!(error.contains("33600 bytes of pixels"), "{error}");
     }
 
     /// Ours, and others' kinds of compression, tiles and sample types.

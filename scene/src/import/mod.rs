@@ -13,6 +13,7 @@ mod options;
 mod placement;
 mod ply;
 mod refraction;
+mod regular;
 mod serialized;
 mod shapes;
 mod sky;
@@ -172,11 +173,8 @@ fn kind(path: &Path) -> Result<Kind, ImportError> {
     if metadata.is_dir() {
         return Ok(Kind::Folder);
     }
-    if !metadata.is_file() {
-        return refuse(path, "neither a file nor a folder");
-    }
     let mut head = vec![];
-    std::fs::File::open(path).and_then(|file| file.take(256).read_to_end(&mut head)).map_err(io)?;
+    regular::open(path).and_then(|(file, _)| file.take(256).read_to_end(&mut head)).map_err(io)?;
     if head.is_empty() {
         return refuse(path, "the file is empty");
     }

@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 
 use flate2::read::{MultiGzDecoder, ZlibDecoder};
 
+use super::regular;
 use crate::ImportError;
 use crate::description::Place;
 
@@ -54,11 +55,7 @@ impl Source {
     /// Opens a regular file.
     pub fn open(path: &Path) -> Result<Source, ImportError> {
         let io = |source| ImportError::Io { path: path.into(), source };
-        let metadata = std::fs::metadata(path).map_err(io)?;
-        if !metadata.is_file() {
-            return Err(io(io::Error::new(io::ErrorKind::InvalidInput, "not a regular file")));
-        }
-        let mut file = File::open(path).map_err(io)?;
+        let (mut file, metadata) = regular::open(path).map_err(io)?;
         let mut magic = [0; 2];
         let gzip = file.read_exact(&mut magic).is_ok() && magic == [0x1f, 0x8b];
         file.seek(SeekFrom::Start(0)).map_err(io)?;

@@ -4,16 +4,24 @@
 
 use std::cell::Cell;
 use std::collections::BTreeMap;
+use std::io::Read;
 use std::path::{Path, PathBuf};
 
 use super::{transform, value};
 use crate::ImportError;
 use crate::description::{Affine, Place};
+use crate::import::regular;
 
 /// Most bytes of XML read for one scene, includes among them.
 const MAX_BYTES: u64 = 64 << 20;
 /// Most nodes in one XML file: bounds the parser's memory to some 400 MB.
 const MAX_NODES: u32 = 4 << 20;
+/// Most bytes of values that `$names` put into one scene's attributes, all together. Defaults may name other defaults, so that a few lines
+/// double their text with each ([billion laughs](https://en.wikipedia.org/wiki/Billion_laughs_attack)), and every value stays in
+/// memory. As much as a scene may have of XML at all: no scene's parameters come near it.
+const MAX_EXPANDED: usize = MAX_BYTES as usize;
+/// Most bytes of one value.
+const MAX_VALUE: usize = 1 << 20;
 /// Deepest nesting of objects; ours is a recursive descent.
 const MAX_DEPTH: usize = 64;
 /// Most attributes of one element: the parser compares each with each.
@@ -156,6 +164,8 @@ pub(super) fn malformed<T>(place: &Place, message: impl Into<String>) -> Result<
 struct Parameters {
     values: BTreeMap<String, String>,
     unused: Vec<String>,
+    /// Bytes of values put in so far.
+    expanded: usize,
 }
 
 impl Parameters {
@@ -163,6 +173,7 @@ impl Parameters {
         Parameters {
             values: defines.iter().cloned().collect(),
             unused: defines.iter().map(|(name, _)| name.clone()).collect(),
+            expanded: 0,
         }
     }
     fn unused_define(&self) -> Option<&str> {
@@ -190,12 +201,25 @@ impl Parameters {
                 let name: String = after.chars().take_while(|c| c.is_alphanumeric() || *c == '_').collect();
                 return malformed(place, format!("${name} has no value: add a <default>, or pass -D {name}=VALUE"));
             };
+            if out.len() + value.len() > MAX_VALUE {
+                return malformed(
+                    place,
+                    format!("${name} makes a value of more than {MAX_VALUE} bytes: does its <default> repeat other defaults?"),
+                );
+            }
+            self.expanded += value.len();
+            if self.expanded > MAX_EXPANDED {
+                return malformed(
+                    place,
+                    format!(
+                        "with ${name} here, the parameters' values add up to more than {MAX_EXPANDED} bytes in this scene: \
+                         write long values once, or shorten the <default>s that repeat others"
+                    ),
+                );
+            }
             out.push_str(value);
             self.unused.retain(|n| n != name);
             rest = &after[name.len()..];
-            if out.len() > (1 << 20) {
-                return malformed(place, "a value grows beyond 1 MiB by its parameters");
-            }
         }
         out.push_str(rest);
         Ok(out)
@@ -238,13 +262,18 @@ impl Reader {
         parameters: &mut Parameters,
     ) -> Result<(), ImportError> {
         let io = |source| ImportError::Io { path: path.into(), source };
-        let length = std::fs::metadata(path).map_err(io)?.len();
-        if length.saturating_add(self.document.bytes_read) > MAX_BYTES {
+        let (file, metadata) = regular::open(path).map_err(io)?;
+        let left = MAX_BYTES - self.document.bytes_read;
+        let mut text = Vec::new();
+        // files of /proc have a length of 0 and content all the same
+        if metadata.len() <= left {
+            file.take(left + 1).read_to_end(&mut text).map_err(io)?;
+        }
+        if metadata.len().max(text.len() as u64) > left {
             let message =
                 format!("more than {MAX_BYTES} bytes of XML with its includes: keep meshes in files of their own");
             return Err(ImportError::Limit { path: path.into(), message });
         }
-        let text = std::fs::read(path).map_err(io)?;
         self.document.bytes_read += text.len() as u64;
         let whole = |message: String| ImportError::Malformed { place: Place { file: path.into(), line: 0 }, message };
         let text = String::from_utf8(text).map_err(|e| {

@@ -11,12 +11,12 @@ mod slices;
 #[cfg(test)]
 mod tests;
 
-use std::fs::File;
 use std::io::Read;
 use std::path::Path;
 
 use crate::ImportError;
 use crate::description::Affine;
+use crate::import::regular;
 use layout::Layout;
 pub use layout::SampleType;
 pub use slices::Slices;
@@ -126,7 +126,7 @@ fn format(path: &Path) -> Result<Option<Format>, ImportError> {
         return Ok(None); // opening a pipe would wait for ever
     }
     let mut first = Vec::new();
-    File::open(path).map_err(io)?.take(132).read_to_end(&mut first).map_err(io)?;
+    regular::open(path).map_err(io)?.0.take(132).read_to_end(&mut first).map_err(io)?;
     if first.starts_with(b"NRRD000") {
         return Ok(Some(Format::Nrrd));
     }

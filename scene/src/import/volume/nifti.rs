@@ -1,7 +1,6 @@
 //! NIfTI-1 and NIfTI-2: `.nii`, `.nii.gz` and pairs of `.hdr` and `.img`, both byte orders. One volume of three dimensions.
 //! Formats: <https://nifti.nimh.nih.gov/nifti-1> and `/nifti-2`.
 
-use std::fs::File;
 use std::io::{self, BufReader, Read};
 use std::path::Path;
 
@@ -11,6 +10,7 @@ use super::layout::{Layout, Part, Skip, check_dims};
 use super::{SampleType, Volume, VolumeFile, malformed};
 use crate::ImportError;
 use crate::description::Affine;
+use crate::import::regular;
 
 const SIZE_1: usize = 348;
 const SIZE_2: usize = 540;
@@ -26,7 +26,7 @@ pub(super) struct Header {
 
 /// Looks whether a file is a NIfTI file.
 pub(super) fn recognise(path: &Path) -> io::Result<Option<Header>> {
-    let mut reader = BufReader::new(File::open(path)?);
+    let mut reader = BufReader::new(regular::open(path)?.0);
     let gzip = io::BufRead::fill_buf(&mut reader)?.starts_with(&[0x1f, 0x8b]);
     let mut bytes = Vec::new();
     if gzip {

@@ -1,6 +1,5 @@
 //! NRRD: attached or detached (NHDR) data, raw or gzip. Format: <https://teem.sourceforge.net/nrrd/format.html>.
 
-use std::fs::File;
 use std::io::{BufRead, BufReader, Read};
 use std::path::{Component, Path, PathBuf};
 
@@ -8,6 +7,7 @@ use super::layout::{Layout, Part, Skip, check_dims};
 use super::{SampleType, Volume, VolumeFile, malformed};
 use crate::ImportError;
 use crate::description::Affine;
+use crate::import::regular;
 
 /// Longest header: room for a list of many thousand files.
 const MAX_HEADER: u64 = 1 << 20;
@@ -61,7 +61,7 @@ struct Header {
 
 pub(super) fn open(path: &Path) -> Result<VolumeFile, ImportError> {
     let io = |source| ImportError::Io { path: path.to_owned(), source };
-    let mut reader = BufReader::new(File::open(path).map_err(io)?.take(MAX_HEADER + 1));
+    let mut reader = BufReader::new(regular::open(path).map_err(io)?.0.take(MAX_HEADER + 1));
     let mut text = Vec::new();
     let mut h = Header::default();
     let mut line = 0;

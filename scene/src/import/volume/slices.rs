@@ -10,6 +10,7 @@ use flate2::bufread::MultiGzDecoder;
 use super::layout::{Layout, Part, SampleType, Skip};
 use super::malformed;
 use crate::ImportError;
+use crate::import::regular;
 
 /// Slices in z order, each once.
 pub struct Slices<'a> {
@@ -96,13 +97,12 @@ impl Read for Counted {
 
 /// A reader at the part's first sample.
 fn open_part(part: &Part, layout: &Layout, bytes: &Rc<Cell<u64>>) -> io::Result<Box<dyn Read>> {
-    let mut file = File::open(&part.path)?;
+    let (mut file, metadata) = regular::open(&part.path)?;
     let need = layout.slice_bytes() as u64 * part.slices as u64;
     let (lines, skip) = match part.skip {
         Skip::Lines(lines, skip) => (lines, skip),
         Skip::FromEnd => {
-            let length = file.metadata()?.len();
-            let start = length.checked_sub(need).ok_or(io::ErrorKind::UnexpectedEof)?;
+            let start = metadata.len().checked_sub(need).ok_or(io::ErrorKind::UnexpectedEof)?;
             (0, start)
         }
     };

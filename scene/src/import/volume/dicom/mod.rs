@@ -4,7 +4,6 @@ mod element;
 
 use std::cell::Cell;
 use std::collections::BTreeMap;
-use std::fs::File;
 use std::io::BufReader;
 use std::path::{Path, PathBuf};
 use std::rc::Rc;
@@ -15,6 +14,7 @@ use super::layout::{Layout, Part, Skip, check_dims};
 use super::slices::Counted;
 use super::{SampleType, Volume, VolumeFile, malformed};
 use crate::ImportError;
+use crate::import::regular;
 
 const SERIES_DESCRIPTION: Tag = (0x0008, 0x103e);
 const SERIES: Tag = (0x0020, 0x000e);
@@ -182,7 +182,7 @@ fn read(path: &Path, bytes: &Rc<Cell<u64>>) -> Result<Option<Found>, ImportError
     if !std::fs::metadata(path).map_err(io)?.is_file() {
         return Ok(None); // opening a pipe would wait for ever
     }
-    let file = Counted { file: File::open(path).map_err(io)?, bytes: bytes.clone() };
+    let file = Counted { file: regular::open(path).map_err(io)?.0, bytes: bytes.clone() };
     // headers of a slice have some 2 KB, and what is read beyond them is read again in each pass
     match element::read(BufReader::with_capacity(2048, file), WANTED) {
         Ok(Some(set)) if set.pixels.is_some() => {
