@@ -266,6 +266,8 @@ pub struct Description {
     pub bounds: Option<[[f64; 3]; 2]>,
     /// Bytes of the source that importing itself read.
     pub bytes_read: u64,
+    /// Passes over all shapes that importing itself made: one if it had to find the bounds by reading, else none.
+    pub passes: u32,
 }
 
 /// Something unsupported that was replaced on request (`--substitute`).

@@ -49,4 +49,8 @@ pub trait RecordStream {
 pub trait RecordSource: Sync {
     /// Starts a pass.
     fn open(&self) -> Result<Box<dyn RecordStream + '_>, ImportError>;
+    /// Starts a pass of which only places count, not normals or texture coordinates: those may be left out where that is cheaper.
+    fn open_places(&self) -> Result<Box<dyn RecordStream + '_>, ImportError> {
+        self.open()
+    }
 }

@@ -98,6 +98,7 @@ pub fn cornell() -> Description {
         substitutions: vec![],
         bounds: None,
         bytes_read: 0,
+        passes: 0,
     }
 }
 

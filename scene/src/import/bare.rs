@@ -65,7 +65,7 @@ pub(super) fn volume(path: &Path, options: &ImportOptions) -> Result<(Descriptio
     let mut out = description(options);
     // the box of the samples is known without a pass over them
     out.bounds = Some(source.world_box());
-    out.bytes_read = source.file().header_bytes();
+    out.bytes_read += source.file().header_bytes();
     out.shapes.push(shape(path, Geometry::IsoSurface { path: path.into(), iso }));
     Ok((out, Up::Z))
 }

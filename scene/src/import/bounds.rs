@@ -11,7 +11,7 @@ pub(super) const EMPTY: [[f64; 3]; 2] = [[f64::INFINITY; 3], [f64::NEG_INFINITY;
 /// Bounds of the finite primitives of a source, by a pass over it; least above greatest if there are none.
 pub fn bounds(source: &dyn RecordSource) -> Result<([[f64; 3]; 2], u64), ImportError> {
     let mut out = EMPTY;
-    let mut stream = source.open()?;
+    let mut stream = source.open_places()?;
     let mut records = vec![];
     loop {
         records.clear();
@@ -52,6 +52,7 @@ pub(super) fn measure(description: &mut Description) -> Result<[[f64; 3]; 2], Im
         bounds(&source)?
     };
     description.bytes_read += bytes;
+    description.passes += 1;
     Ok(bounds)
 }
 

@@ -76,6 +76,7 @@ impl IsoSurfaceSource {
             cursor: Cursor::default(),
             kept: Vec::new(),
             ended: false,
+            before: 0,
         };
         stream.slices.next(&mut stream.low.samples)?;
         stream.low.mark(stream.grid.width, stream.grid.iso);
@@ -103,9 +104,16 @@ pub struct IsoSurfaceStream<'a> {
     /// The rest of a cell that did not fit.
     kept: Vec<Record>,
     ended: bool,
+    /// Bytes that were read for this pass before it began.
+    before: u64,
 }
 
 impl IsoSurfaceStream<'_> {
+    /// The same pass, for which so many bytes of headers were read already.
+    pub(super) fn after(self, before: u64) -> Self {
+        IsoSurfaceStream { before, ..self }
+    }
+
     /// Reads the upper slice; false when there is none.
     fn read(&mut self) -> Result<bool, ImportError> {
         let more = self.slices.next(&mut self.high.samples)?;
@@ -137,6 +145,6 @@ impl RecordStream for IsoSurfaceStream<'_> {
     }
 
     fn bytes_read(&self) -> u64 {
-        self.slices.bytes_read()
+        self.before + self.slices.bytes_read()
     }
 }

@@ -3,20 +3,30 @@
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicU64, Ordering};
 
+use bytemuck::Pod;
+
 use super::placement::Placement;
 use super::source::Source;
-use super::spill::{Budget, Column};
+use super::spill::{Budget, Column, Table};
 use super::stream::StreamOptions;
 use super::vector::{cross, dot, normalize, sub};
 use crate::ImportError;
 use crate::record::{Record, RecordStream};
 
-/// Reads triangles one at a time, in the file's order.
+/// Reads triangles one at a time, in the file's order, once.
 pub(super) trait TriangleReader {
-    /// The next triangle; none at the end.
-    fn next(&mut self) -> Result<Option<Corners>, ImportError>;
-    /// Goes back to before the first triangle.
-    fn rewind(&mut self) -> Result<(), ImportError>;
+    /// What is kept of a triangle while others are read: numbers into the reader's arrays.
+    type Triangle: Pod;
+    /// The next triangle; none at the end, then and later.
+    fn next(&mut self) -> Result<Option<Self::Triangle>, ImportError>;
+    /// Its corners.
+    fn corners(&self, triangle: &Self::Triangle) -> Corners;
+    /// Whether the file gives it normals.
+    fn has_normals(&self, triangle: &Self::Triangle) -> bool;
+    /// Numbers of its vertices, below [`TriangleReader::vertex_count`].
+    fn vertices(triangle: &Self::Triangle) -> [usize; 3];
+    /// Vertices read so far.
+    fn vertex_count(&self) -> usize;
     fn source(&self) -> &Source;
     fn budget(&mut self) -> &mut Budget;
 }
@@ -27,8 +37,6 @@ pub(super) struct Corners {
     pub p: [[f64; 3]; 3],
     pub n: Option<[[f32; 3]; 3]>,
     pub uv: Option<[[f32; 2]; 3]>,
-    /// Numbers of the vertices, for smooth normals; no format without them asks for any.
-    pub vertices: [usize; 3],
 }
 
 /// A reader as a stream of records.
@@ -36,8 +44,8 @@ pub(super) struct MeshStream<'a, R: TriangleReader> {
     reader: R,
     placement: Placement,
     flip_v: bool,
-    /// Sums of weighted normals by vertex, where smooth normals were asked for and the file has none.
-    smooth: Option<Vec<[f64; 3]>>,
+    /// What was read ahead to smooth it, before what the reader still has.
+    kept: Option<Kept<R::Triangle>>,
     spilled: &'a AtomicU64,
     counted: u64,
 }
@@ -53,21 +61,15 @@ pub(super) struct MeshOptions<'a> {
 impl<'a, R: TriangleReader> MeshStream<'a, R> {
     pub fn new(mut reader: R, options: MeshOptions<'a>) -> Result<Self, ImportError> {
         let wanted = options.smooth && options.placement.keeps_normals();
-        let smooth = if wanted { vertex_normals(&mut reader)? } else { None };
+        let kept = if wanted { Some(Kept::read(&mut reader)?) } else { None };
         Ok(MeshStream {
             reader,
             placement: options.placement,
             flip_v: options.flip_v,
-            smooth,
+            kept,
             spilled: options.spilled,
             counted: 0,
         })
-    }
-
-    fn normals(&self, vertices: [usize; 3]) -> Option<[[f32; 3]; 3]> {
-        let sums = self.smooth.as_ref()?;
-        let [a, b, c] = vertices.map(|v| sums.get(v).and_then(|s| normalize(*s)).map(|n| n.map(|x| x as f32)));
-        Some([a?, b?, c?])
     }
 }
 
@@ -75,13 +77,18 @@ impl<R: TriangleReader> RecordStream for MeshStream<'_, R> {
     fn next(&mut self, out: &mut Vec<Record>, max: usize) -> Result<usize, ImportError> {
         let mut n = 0;
         while n < max {
-            let Some(corners) = self.reader.next()? else { break };
+            let triangle = match self.kept.as_mut().and_then(Kept::next) {
+                Some(kept) => Some(kept),
+                None => self.reader.next()?,
+            };
+            let Some(triangle) = triangle else { break };
+            let corners = self.reader.corners(&triangle);
             let mut uv = corners.uv;
             if self.flip_v {
                 uv.iter_mut().flatten().for_each(|uv| uv[1] = 1.0 - uv[1]);
             }
-            let normals = corners.n.or_else(|| self.normals(corners.vertices));
-            out.push(self.placement.triangle(corners.p, normals, uv));
+            let smooth = || self.kept.as_ref()?.normals(R::vertices(&triangle));
+            out.push(self.placement.triangle(corners.p, corners.n.or_else(smooth), uv));
             n += 1;
         }
         let spilled = self.reader.budget().spilled();
@@ -95,30 +102,52 @@ impl<R: TriangleReader> RecordStream for MeshStream<'_, R> {
     }
 }
 
-/// Sums per vertex of the unit normals of its triangles, weighted by the angle at the vertex (Thuermer and Wuethrich,
-/// "Computing vertex normals from polygonal facets", JGT 3(1), 1998: Mitsuba's rule); none if the file has normals itself.
-fn vertex_normals(reader: &mut impl TriangleReader) -> Result<Option<Vec<[f64; 3]>>, ImportError> {
-    let mut sums: Vec<[f64; 3]> = vec![];
-    while let Some(corners) = reader.next()? {
-        if corners.n.is_some() {
-            reader.rewind()?;
-            return Ok(None);
-        }
-        let needed = corners.vertices.into_iter().max().unwrap_or(0) + 1;
-        if needed > sums.len() {
-            let grown = needed.max(sums.len() + sums.len() / 2);
-            if !reader.budget().take(((grown - sums.len()) * size_of::<[f64; 3]>()) as u64) {
-                return reader.source().fail_limit(
-                    "smooth normals of so many vertices exceed the vertex budget: write normals into the file, set \
-                     face_normals, or raise the budget",
-                );
+/// Triangles that were read ahead of the stream: the normal of a vertex is known when the last triangle around it is, and the file is
+/// read only once. Like the vertices they are in memory up to the mesh's budget, then in its spill file.
+struct Kept<T> {
+    triangles: Column<T>,
+    next: usize,
+    /// Sums of weighted normals by vertex; none if the file has normals itself, and then not all triangles are kept.
+    sums: Option<Table<[f64; 3]>>,
+}
+
+impl<T: Pod> Kept<T> {
+    fn read<R: TriangleReader<Triangle = T>>(reader: &mut R) -> Result<Self, ImportError> {
+        let mut triangles = Column::new();
+        while let Some(triangle) = reader.next()? {
+            triangles.push(triangle, reader.budget()).map_err(|e| reader.source().io(e))?;
+            if reader.has_normals(&triangle) {
+                return Ok(Kept { triangles, next: 0, sums: None });
             }
-            sums.resize(grown, [0.0; 3]);
         }
-        let [a, b, c] = corners.p;
+        let vertices = reader.vertex_count();
+        let mut sums = Table::zeroed(vertices, reader.budget()).map_err(|e| reader.source().io(e))?;
+        add_normals(reader, &triangles, sums.values_mut());
+        Ok(Kept { triangles, next: 0, sums: Some(sums) })
+    }
+
+    fn next(&mut self) -> Option<T> {
+        let triangle = self.triangles.get(self.next)?;
+        self.next += 1;
+        Some(triangle)
+    }
+
+    fn normals(&self, vertices: [usize; 3]) -> Option<[[f32; 3]; 3]> {
+        let sums = self.sums.as_ref()?.values();
+        let [a, b, c] = vertices.map(|v| sums.get(v).and_then(|s| normalize(*s)).map(|n| n.map(|x| x as f32)));
+        Some([a?, b?, c?])
+    }
+}
+
+/// Adds, per vertex, the unit normals of its triangles, weighted by the angle at the vertex (Thuermer and Wuethrich,
+/// "Computing vertex normals from polygonal facets", JGT 3(1), 1998: Mitsuba's rule).
+fn add_normals<R: TriangleReader>(reader: &R, triangles: &Column<R::Triangle>, sums: &mut [[f64; 3]]) {
+    for triangle in (0..triangles.len()).filter_map(|i| triangles.get(i)) {
+        let p = reader.corners(&triangle).p;
+        let [a, b, c] = p;
         let Some(normal) = normalize(cross(sub(b, a), sub(c, a))) else { continue };
-        for (i, vertex) in corners.vertices.into_iter().enumerate() {
-            let [at, next, last] = [0, 1, 2].map(|k| corners.p[(i + k) % 3]);
+        for (i, vertex) in R::vertices(&triangle).into_iter().enumerate() {
+            let [at, next, last] = [0, 1, 2].map(|k| p[(i + k) % 3]);
             if let (Some(u), Some(v)) = (normalize(sub(next, at)), normalize(sub(last, at))) {
                 let angle = libm::acos(dot(u, v).clamp(-1.0, 1.0));
                 for (sum, n) in sums[vertex].iter_mut().zip(normal) {
@@ -127,8 +156,6 @@ fn vertex_normals(reader: &mut impl TriangleReader) -> Result<Option<Vec<[f64; 3
             }
         }
     }
-    reader.rewind()?;
-    Ok(Some(sums))
 }
 
 /// The budget that the options give one mesh.

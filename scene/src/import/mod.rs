@@ -85,9 +85,9 @@ pub fn import_surface(path: &Path, options: &ImportOptions) -> Result<Descriptio
 
 /// What the source says, which way is up, and whether it is a surface without a scene.
 fn read(path: &Path, options: &ImportOptions) -> Result<(Description, Up, bool), ImportError> {
-    let kind = kind(path)?;
+    let (kind, head) = kind(path)?;
     let bare = !matches!(kind, Kind::Mitsuba);
-    let (out, up) = match kind {
+    let (mut out, up) = match kind {
         Kind::Mitsuba => {
             for (given, name) in [(options.iso.is_some(), "an iso value"), (options.albedo.is_some(), "an albedo")] {
                 if given {
@@ -115,6 +115,7 @@ fn read(path: &Path, options: &ImportOptions) -> Result<(Description, Up, bool),
     if out.shapes.is_empty() {
         return refuse(path, "the scene has no shapes: there is nothing to render");
     }
+    out.bytes_read += head;
     Ok((out, up, bare))
 }
 
@@ -166,19 +167,24 @@ fn place_camera(
     Ok(())
 }
 
-/// Tells what a path holds, by its content where that says it, else by its name.
-fn kind(path: &Path) -> Result<Kind, ImportError> {
+/// Tells what a path holds, by its content where that says it, else by its name; and the bytes read for it.
+fn kind(path: &Path) -> Result<(Kind, u64), ImportError> {
     let io = |source| ImportError::Io { path: path.into(), source };
     let metadata = std::fs::metadata(path).map_err(io)?;
     if metadata.is_dir() {
-        return Ok(Kind::Folder);
+        return Ok((Kind::Folder, 0));
     }
     let mut head = vec![];
     regular::open(path).and_then(|(file, _)| file.take(256).read_to_end(&mut head)).map_err(io)?;
     if head.is_empty() {
         return refuse(path, "the file is empty");
     }
-    let text = head.strip_prefix(b"\xef\xbb\xbf").unwrap_or(&head).trim_ascii_start();
+    Ok((kind_of(path, &head)?, head.len() as u64))
+}
+
+/// What a file holds that begins with `head`.
+fn kind_of(path: &Path, head: &[u8]) -> Result<Kind, ImportError> {
+    let text = head.strip_prefix(b"\xef\xbb\xbf").unwrap_or(head).trim_ascii_start();
     if text.starts_with(b"<") {
         return Ok(Kind::Mitsuba);
     }

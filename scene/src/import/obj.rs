@@ -13,6 +13,10 @@ use crate::ImportError;
 /// Longest line with its continuations.
 const MAX_LINE: usize = 1 << 20;
 
+/// Numbers of a corner's `v`, `vt` and `vn`, [`NONE`] where it has none.
+type Corner = [u32; 3];
+const NONE: u32 = u32::MAX;
+
 /// An OBJ file being read.
 pub(super) struct ObjReader {
     source: Source,
@@ -20,10 +24,8 @@ pub(super) struct ObjReader {
     positions: Positions,
     uv: Column<[f32; 2]>,
     normals: Column<[f32; 3]>,
-    /// `v`, `vt` and `vn` passed in this reading; arrays are filled in the first.
-    seen: [usize; 3],
     /// Corners of the polygon being fanned, and the triangles made of it.
-    polygon: Vec<[Option<usize>; 3]>,
+    polygon: Vec<Corner>,
     fanned: usize,
     line: Vec<u8>,
     /// Whether anything was read that an OBJ file has.
@@ -39,7 +41,6 @@ impl ObjReader {
             positions: Positions::Double(Column::new()),
             uv: Column::new(),
             normals: Column::new(),
-            seen: [0; 3],
             polygon: vec![],
             fanned: 0,
             line: vec![],
@@ -87,17 +88,13 @@ impl ObjReader {
                 }
             }
         }
-        if !self.recognized && self.seen[0] == 0 {
+        if !self.recognized && self.positions.len() == 0 {
             return self.source.fail_line("no vertex and no face in this file: it is no OBJ file, or it is empty");
         }
         Ok(false)
     }
 
     fn vertex<'w>(&mut self, words: impl Iterator<Item = &'w [u8]>) -> Result<(), ImportError> {
-        self.seen[0] += 1;
-        if self.seen[0] <= self.positions.len() {
-            return Ok(());
-        }
         let p = self.numbers::<f64, 3>(words, "v", 3)?;
         match &mut self.positions {
             Positions::Double(column) => column.push(p, &mut self.budget).map_err(|e| self.source.io(e)),
@@ -106,19 +103,11 @@ impl ObjReader {
     }
 
     fn texture_coordinate<'w>(&mut self, words: impl Iterator<Item = &'w [u8]>) -> Result<(), ImportError> {
-        self.seen[1] += 1;
-        if self.seen[1] <= self.uv.len() {
-            return Ok(());
-        }
         let uv = self.numbers::<f32, 2>(words, "vt", 1)?;
         self.uv.push(uv, &mut self.budget).map_err(|e| self.source.io(e))
     }
 
     fn normal<'w>(&mut self, words: impl Iterator<Item = &'w [u8]>) -> Result<(), ImportError> {
-        self.seen[2] += 1;
-        if self.seen[2] <= self.normals.len() {
-            return Ok(());
-        }
         let n = self.numbers::<f32, 3>(words, "vn", 3)?;
         self.normals.push(n, &mut self.budget).map_err(|e| self.source.io(e))
     }
@@ -155,14 +144,14 @@ impl ObjReader {
             if word[0] == b'#' {
                 break;
             }
-            let mut corner = [None; 3];
+            let mut corner = [NONE; 3];
             let mut parts = word.split(|b| *b == b'/');
             for (k, slot) in corner.iter_mut().enumerate() {
                 if let Some(part) = parts.next().filter(|p| !p.is_empty()) {
-                    *slot = Some(self.index(part, k, word)?);
+                    *slot = self.index(part, k, word)?;
                 }
             }
-            if corner[0].is_none() || parts.next().is_some() {
+            if corner[0] == NONE || parts.next().is_some() {
                 return self
                     .source
                     .fail_line(format!("\"{}\" is no corner of the form v, v/vt, v//vn or v/vt/vn", show(word)));
@@ -173,14 +162,17 @@ impl ObjReader {
     }
 
     /// A number from 1, or from -1 backwards, as a place in the array of `v`, `vt` or `vn`.
-    fn index(&self, part: &[u8], kind: usize, word: &[u8]) -> Result<usize, ImportError> {
+    fn index(&self, part: &[u8], kind: usize, word: &[u8]) -> Result<u32, ImportError> {
         let Some(value) = number::<i64>(part) else {
             return self.source.fail_line(format!("\"{}\" where a corner of a face should be", show(word)));
         };
-        let seen = self.seen[kind] as i64;
+        let seen = [self.positions.len(), self.uv.len(), self.normals.len()][kind] as i64;
         let index = if value < 0 { seen.checked_add(value) } else { value.checked_sub(1) };
         match index {
-            Some(i) if (0..seen).contains(&i) => Ok(i as usize),
+            Some(i) if (0..seen).contains(&i) && i < i64::from(NONE) => Ok(i as u32),
+            Some(i) if (0..seen).contains(&i) => {
+                self.source.fail_limit(format!("more than {NONE} of one kind of vertex: cut the mesh into several files"))
+            }
             _ => {
                 let name = ["v", "vt", "vn"][kind];
                 self.source.fail_line(format!("index {value} of {name}, but {seen} of them stand above"))
@@ -190,31 +182,39 @@ impl ObjReader {
 }
 
 impl TriangleReader for ObjReader {
-    fn next(&mut self) -> Result<Option<Corners>, ImportError> {
+    type Triangle = [Corner; 3];
+
+    fn next(&mut self) -> Result<Option<[Corner; 3]>, ImportError> {
         if self.fanned + 2 >= self.polygon.len() && !self.next_polygon()? {
             return Ok(None);
         }
-        let corners = [0, self.fanned + 1, self.fanned + 2].map(|i| self.polygon[i]);
         self.fanned += 1;
-        // every index was compared with the numbers of its kind
-        let vertices = corners.map(|c| c[0].unwrap_or(0));
-        let all = |k: usize| {
-            let [a, b, c] = corners.map(|c| c[k]);
-            Some([a?, b?, c?])
-        };
-        Ok(Some(Corners {
-            p: vertices.map(|i| self.positions.get(i).unwrap_or([f64::NAN; 3])),
-            n: all(2).map(|n| n.map(|i| self.normals.get(i).unwrap_or_default())),
-            uv: all(1).map(|uv| uv.map(|i| self.uv.get(i).unwrap_or_default())),
-            vertices,
-        }))
+        Ok(Some([0, self.fanned, self.fanned + 1].map(|i| self.polygon[i])))
     }
 
-    fn rewind(&mut self) -> Result<(), ImportError> {
-        self.seen = [0; 3];
-        self.polygon.clear();
-        self.fanned = 0;
-        self.source.seek(0, 0)
+    fn corners(&self, triangle: &[Corner; 3]) -> Corners {
+        // every index was compared with the numbers of its kind
+        let all = |k: usize| {
+            let has = triangle.iter().all(|c| c[k] != NONE);
+            has.then(|| triangle.map(|c| c[k] as usize))
+        };
+        Corners {
+            p: Self::vertices(triangle).map(|i| self.positions.get(i).unwrap_or([f64::NAN; 3])),
+            n: all(2).map(|n| n.map(|i| self.normals.get(i).unwrap_or_default())),
+            uv: all(1).map(|uv| uv.map(|i| self.uv.get(i).unwrap_or_default())),
+        }
+    }
+
+    fn has_normals(&self, triangle: &[Corner; 3]) -> bool {
+        triangle.iter().all(|c| c[2] != NONE)
+    }
+
+    fn vertices(triangle: &[Corner; 3]) -> [usize; 3] {
+        triangle.map(|c| c[0] as usize)
+    }
+
+    fn vertex_count(&self) -> usize {
+        self.positions.len()
     }
 
     fn source(&self) -> &Source {

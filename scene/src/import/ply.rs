@@ -26,8 +26,6 @@ pub(super) struct PlyReader {
     faces: Element,
     /// Which property of a face lists its vertices.
     list: usize,
-    /// Byte and line of the first face.
-    first: (u64, u32),
     /// Faces that have not begun.
     left: u64,
     fan: Fan,
@@ -36,8 +34,8 @@ pub(super) struct PlyReader {
 /// What is left of a polygon.
 #[derive(Default)]
 struct Fan {
-    first: usize,
-    previous: usize,
+    first: u32,
+    previous: u32,
     left: u64,
 }
 
@@ -71,7 +69,6 @@ impl PlyReader {
                     {
                         return source.fail_line("vertex_indices are floating point numbers: use int or uint");
                     }
-                    let first = (source.offset(), source.line());
                     let left = element.count;
                     let (format, faces, fan) = (header.format, element, Fan::default());
                     return Ok(PlyReader {
@@ -83,7 +80,6 @@ impl PlyReader {
                         uv,
                         faces,
                         list,
-                        first,
                         left,
                         fan,
                     });
@@ -100,10 +96,11 @@ impl PlyReader {
         source.fail_line("no element face: a point cloud or strips cannot be rendered, write triangles or polygons")
     }
 
-    fn index(&mut self, kind: Kind) -> Result<usize, ImportError> {
+    /// PLY has no wider whole numbers than 32 bits.
+    fn index(&mut self, kind: Kind) -> Result<u32, ImportError> {
         let value = integer(&mut self.source, self.format, kind)?;
-        match usize::try_from(value) {
-            Ok(i) if i < self.positions.len() => Ok(i),
+        match u32::try_from(value) {
+            Ok(i) if (i as usize) < self.positions.len() => Ok(i),
             _ => self.fail(format!("vertex index {value}, but the file has {} vertices", self.positions.len())),
         }
     }
@@ -153,7 +150,9 @@ impl PlyReader {
 }
 
 impl TriangleReader for PlyReader {
-    fn next(&mut self) -> Result<Option<Corners>, ImportError> {
+    type Triangle = [u32; 3];
+
+    fn next(&mut self) -> Result<Option<[u32; 3]>, ImportError> {
         let Property::List { count, kind, .. } = self.faces.properties[self.list] else {
             unreachable!("chosen as a list when the file was opened")
         };
@@ -166,22 +165,32 @@ impl TriangleReader for PlyReader {
         if self.fan.left == 0 {
             self.end()?;
         }
+        Ok(Some(vertices))
+    }
+
+    fn corners(&self, triangle: &[u32; 3]) -> Corners {
         // every index was compared with the number of vertices
+        let vertices = Self::vertices(triangle);
         let corner = |i| self.positions.get(i).unwrap_or([f64::NAN; 3]);
         let gather3 = |c: &Column<[f32; 3]>| vertices.map(|i| c.get(i).unwrap_or_default());
         let gather2 = |c: &Column<[f32; 2]>| vertices.map(|i| c.get(i).unwrap_or_default());
-        Ok(Some(Corners {
+        Corners {
             p: vertices.map(corner),
             n: self.normals.as_ref().map(gather3),
             uv: self.uv.as_ref().map(gather2),
-            vertices,
-        }))
+        }
     }
 
-    fn rewind(&mut self) -> Result<(), ImportError> {
-        self.left = self.faces.count;
-        self.fan = Fan::default();
-        self.source.seek(self.first.0, self.first.1)
+    fn has_normals(&self, _: &[u32; 3]) -> bool {
+        self.normals.is_some()
+    }
+
+    fn vertices(triangle: &[u32; 3]) -> [usize; 3] {
+        triangle.map(|i| i as usize)
+    }
+
+    fn vertex_count(&self) -> usize {
+        self.positions.len()
     }
 
     fn source(&self) -> &Source {

@@ -29,8 +29,6 @@ pub(super) struct SerializedReader {
     face_normals: bool,
     /// Bytes of an index: 4, or 8 in meshes of more than 2^32 vertices.
     index: usize,
-    /// Byte of the first triangle, unpacked.
-    first: u64,
     count: u64,
     done: u64,
 }
@@ -40,7 +38,7 @@ impl SerializedReader {
     pub fn open(path: &Path, index: u32, options: &StreamOptions) -> Result<Self, ImportError> {
         let mut file = Source::open(path)?;
         let (at, version) = find(&mut file, index)?;
-        let mut source = Source::open_zlib(path, at + 4)?;
+        let mut source = file.into_zlib(at + 4)?;
         let flags = u32_of(&mut source)?;
         if version == 4 {
             let mut length = 0;
@@ -86,8 +84,8 @@ impl SerializedReader {
         };
         source.skip(vertices * color * size)?;
         let face_normals = flags & FACE_NORMALS != 0;
-        let (first, normals, index) = (source.offset(), normals.filter(|_| !face_normals), index as usize);
-        Ok(SerializedReader { source, budget, positions, normals, uv, face_normals, index, first, count, done: 0 })
+        let (normals, index) = (normals.filter(|_| !face_normals), index as usize);
+        Ok(SerializedReader { source, budget, positions, normals, uv, face_normals, index, count, done: 0 })
     }
 
     /// The mesh says that it has no smooth normals and wants none.
@@ -98,18 +96,17 @@ impl SerializedReader {
 
 /// Byte where mesh number `index` begins, and its version.
 fn find(file: &mut Source, index: u32) -> Result<(u64, u16), ImportError> {
-    let version = header(file)?;
+    let Some(length) = file.length() else {
+        return file.fail_byte("a gzip file of serialized meshes, which are packed already: unpack it");
+    };
+    let version = header(file, length, 0)?;
     if index == 0 {
         return Ok((0, version));
     }
-    let Some(length) = file.length() else {
-        return file.fail_byte("a gzip file of several meshes: unpack it");
-    };
     if length < 8 {
         return file.fail_byte("the file is too short for a list of meshes");
     }
-    file.seek(length - 4, 0)?;
-    let count = u32_of(file)?;
+    let count = u32::from_le_bytes(bytes_at(file, length - 4)?);
     if index >= count {
         return file.fail_byte(format!("shape_index {index}, but the file has {count} meshes"));
     }
@@ -117,18 +114,28 @@ fn find(file: &mut Source, index: u32) -> Result<(u64, u16), ImportError> {
     let Some(entry) = (length - 4).checked_sub(size * u64::from(count - index)) else {
         return file.fail_byte(format!("a list of {count} meshes is longer than the file"));
     };
-    file.seek(entry, 0)?;
-    let at = if version == 4 { u64_of(file)? } else { u32_of(file)?.into() };
+    let at = match version {
+        4 => u64::from_le_bytes(bytes_at(file, entry)?),
+        _ => u32::from_le_bytes(bytes_at(file, entry)?).into(),
+    };
     if at >= length {
         return file.fail_byte(format!("mesh {index} begins at byte {at}, beyond the end of the file"));
     }
-    file.seek(at, 0)?;
-    Ok((at, header(file)?))
+    Ok((at, header(file, length, at)?))
 }
 
-/// Version of the mesh that begins here.
-fn header(file: &mut Source) -> Result<u16, ImportError> {
-    let head = file.exact(4)?;
+fn bytes_at<const N: usize>(file: &mut Source, at: u64) -> Result<[u8; N], ImportError> {
+    let mut out = [0; N];
+    file.read_at(at, &mut out)?;
+    Ok(out)
+}
+
+/// Version of the mesh that begins at a byte.
+fn header(file: &mut Source, length: u64, at: u64) -> Result<u16, ImportError> {
+    if length - at < 4 {
+        return file.fail_byte("the file ends within the head of a mesh: it is truncated, get it again");
+    }
+    let head: [u8; 4] = bytes_at(file, at)?;
     let word = |i: usize| u16::from_le_bytes([head[i], head[i + 1]]);
     match (word(0), word(2)) {
         (MAGIC, version @ (3 | 4)) => Ok(version),
@@ -173,40 +180,44 @@ fn u64_of(source: &mut Source) -> Result<u64, ImportError> {
 }
 
 impl TriangleReader for SerializedReader {
-    fn next(&mut self) -> Result<Option<Corners>, ImportError> {
+    type Triangle = [u64; 3];
+
+    fn next(&mut self) -> Result<Option<[u64; 3]>, ImportError> {
         if self.done == self.count {
             return Ok(None);
         }
         let mut vertices = [0; 3];
         for vertex in &mut vertices {
-            let value = if self.index == 8 { u64_of(&mut self.source)? } else { u32_of(&mut self.source)?.into() };
-            *vertex = match usize::try_from(value) {
-                Ok(i) if i < self.positions.len() => i,
-                _ => {
-                    let message = format!("triangle {}: vertex {value} of {}", self.done, self.positions.len());
-                    return self.source.fail_byte(message);
-                }
-            };
+            *vertex = if self.index == 8 { u64_of(&mut self.source)? } else { u32_of(&mut self.source)?.into() };
+            if *vertex >= self.positions.len() as u64 {
+                let message = format!("triangle {}: vertex {vertex} of {}", self.done, self.positions.len());
+                return self.source.fail_byte(message);
+            }
         }
         self.done += 1;
-        let gone = |i: usize| self.source.fail_byte::<Corners>(format!("vertex {i} is missing"));
-        let [Some(a), Some(b), Some(c)] = vertices.map(|i| self.positions.get(i)) else {
-            return gone(vertices[0]).map(Some);
-        };
-        let n = self.normals.as_ref().and_then(|n| {
-            let [a, b, c] = vertices.map(|i| n.get(i));
-            Some([a?, b?, c?])
-        });
-        let uv = self.uv.as_ref().and_then(|uv| {
-            let [a, b, c] = vertices.map(|i| uv.get(i));
-            Some([a?, b?, c?])
-        });
-        Ok(Some(Corners { p: [a, b, c], n, uv, vertices }))
+        Ok(Some(vertices))
     }
 
-    fn rewind(&mut self) -> Result<(), ImportError> {
-        self.done = 0;
-        self.source.seek(self.first, 0)
+    fn corners(&self, triangle: &[u64; 3]) -> Corners {
+        // every index was compared with the number of vertices
+        let vertices = Self::vertices(triangle);
+        Corners {
+            p: vertices.map(|i| self.positions.get(i).unwrap_or([f64::NAN; 3])),
+            n: self.normals.as_ref().map(|n| vertices.map(|i| n.get(i).unwrap_or_default())),
+            uv: self.uv.as_ref().map(|uv| vertices.map(|i| uv.get(i).unwrap_or_default())),
+        }
+    }
+
+    fn has_normals(&self, _: &[u64; 3]) -> bool {
+        self.normals.is_some()
+    }
+
+    fn vertices(triangle: &[u64; 3]) -> [usize; 3] {
+        triangle.map(|i| i as usize)
+    }
+
+    fn vertex_count(&self) -> usize {
+        self.positions.len()
     }
 
     fn source(&self) -> &Source {

@@ -1,7 +1,8 @@
 //! A file being read once from front to back, in bounded memory; gzip is unpacked on the way.
 
 use std::fs::File;
-use std::io::{self, Read, Seek, SeekFrom};
+use std::io::{self, Chain, Cursor, Read, Seek, SeekFrom};
+use std::os::unix::fs::FileExt;
 use std::path::{Path, PathBuf};
 
 use flate2::read::{MultiGzDecoder, ZlibDecoder};
@@ -29,15 +30,14 @@ pub(super) struct Source {
     /// Line of the last word or line read, from 1.
     line: u32,
     file_length: u64,
-    /// Read from files that were opened before this one (see [`Source::seek`]).
-    earlier: u64,
 }
 
 enum Input {
     Plain(Counting),
-    Gzip(Box<MultiGzDecoder<Counting>>),
-    /// From this byte of the file on.
-    Zlib(Box<ZlibDecoder<Counting>>, u64),
+    /// After the two bytes that told it.
+    Gzip(Box<MultiGzDecoder<Chain<Cursor<[u8; 2]>, Counting>>>),
+    /// From the place in the file where it was told to begin.
+    Zlib(Box<ZlibDecoder<Counting>>),
 }
 
 /// A file that counts what is read.
@@ -55,43 +55,38 @@ impl Source {
     /// Opens a regular file.
     pub fn open(path: &Path) -> Result<Source, ImportError> {
         let io = |source| ImportError::Io { path: path.into(), source };
-        let (mut file, metadata) = regular::open(path).map_err(io)?;
-        let mut magic = [0; 2];
-        let gzip = file.read_exact(&mut magic).is_ok() && magic == [0x1f, 0x8b];
-        file.seek(SeekFrom::Start(0)).map_err(io)?;
-        let file = Counting(file, 0);
-        let input = if gzip { Input::Gzip(Box::new(MultiGzDecoder::new(file))) } else { Input::Plain(file) };
+        let (file, metadata) = regular::open(path).map_err(io)?;
+        let mut file = Counting(file, 0);
+        let mut first = Vec::with_capacity(2);
+        file.by_ref().take(2).read_to_end(&mut first).map_err(io)?;
+        let mut buffer = vec![0; BUFFER].into_boxed_slice();
+        // nothing is read twice: the first bytes go where they belong
+        let (input, end) = match first[..] {
+            [a @ 0x1f, b @ 0x8b] => (Input::Gzip(Box::new(MultiGzDecoder::new(Cursor::new([a, b]).chain(file)))), 0),
+            _ => {
+                buffer[..first.len()].copy_from_slice(&first);
+                (Input::Plain(file), first.len())
+            }
+        };
         Ok(Source {
             path: path.into(),
             input,
-            buffer: vec![0; BUFFER].into_boxed_slice(),
+            buffer,
             start: 0,
-            end: 0,
+            end,
             offset: 0,
             line: 0,
             file_length: metadata.len(),
-            earlier: 0,
         })
-    }
-
-    /// Opens the zlib data that begin at a byte of a regular file.
-    pub fn open_zlib(path: &Path, at: u64) -> Result<Source, ImportError> {
-        let mut source = Source::open(path)?;
-        let io = |source| ImportError::Io { path: path.into(), source };
-        let mut file = File::open(path).map_err(io)?;
-        file.seek(SeekFrom::Start(at)).map_err(io)?;
-        source.input = Input::Zlib(Box::new(ZlibDecoder::new(Counting(file, 0))), at);
-        Ok(source)
     }
 
     /// Bytes read from disk, packed ones for gzip.
     pub fn bytes_read(&self) -> u64 {
-        self.earlier
-            + match &self.input {
-                Input::Plain(file) => file.1,
-                Input::Gzip(decoder) => decoder.get_ref().1,
-                Input::Zlib(decoder, _) => decoder.get_ref().1,
-            }
+        match &self.input {
+            Input::Plain(file) => file.1,
+            Input::Gzip(decoder) => decoder.get_ref().get_ref().1.1,
+            Input::Zlib(decoder) => decoder.get_ref().1,
+        }
     }
 
     /// Length of the content, if that is known before reading it.
@@ -109,29 +104,26 @@ impl Source {
         self.offset
     }
 
-    /// Line of the last word or line read.
-    pub fn line(&self) -> u32 {
-        self.line
+    /// Reads bytes at a place of a file that is not packed, wherever the reading is.
+    pub fn read_at(&mut self, offset: u64, out: &mut [u8]) -> Result<(), ImportError> {
+        let Input::Plain(file) = &mut self.input else {
+            return self.fail_byte("places in a packed file cannot be looked up: unpack it");
+        };
+        match file.0.read_exact_at(out, offset) {
+            Ok(()) => file.1 += out.len() as u64,
+            Err(e) => return Err(ImportError::Io { path: self.path.clone(), source: e }),
+        }
+        Ok(())
     }
 
-    /// Goes to an offset, and the line that it is in; a second pass over (part of) the file.
-    pub fn seek(&mut self, offset: u64, line: u32) -> Result<(), ImportError> {
-        let mut fresh = match self.input {
-            Input::Zlib(_, at) => Source::open_zlib(&self.path, at)?,
-            _ => Source::open(&self.path)?,
+    /// The zlib data that begin at a byte of a file that is not packed otherwise.
+    pub fn into_zlib(self, at: u64) -> Result<Source, ImportError> {
+        let Input::Plain(mut file) = self.input else {
+            return self.fail_byte("packed twice: unpack it once");
         };
-        fresh.earlier = self.bytes_read();
-        match &mut fresh.input {
-            Input::Plain(file) => {
-                let io = |source| ImportError::Io { path: self.path.clone(), source };
-                file.0.seek(SeekFrom::Start(offset)).map_err(io)?;
-                fresh.offset = offset;
-            }
-            Input::Gzip(_) | Input::Zlib(..) => fresh.skip(offset)?,
-        }
-        fresh.line = line;
-        *self = fresh;
-        Ok(())
+        file.0.seek(SeekFrom::Start(at)).map_err(|source| ImportError::Io { path: self.path.clone(), source })?;
+        let input = Input::Zlib(Box::new(ZlibDecoder::new(file)));
+        Ok(Source { input, start: 0, end: 0, offset: 0, ..self })
     }
 
     /// An error at the last line read.
@@ -170,7 +162,7 @@ impl Source {
             let result = match &mut self.input {
                 Input::Plain(file) => file.read(room),
                 Input::Gzip(decoder) => decoder.read(room),
-                Input::Zlib(decoder, _) => decoder.read(room),
+                Input::Zlib(decoder) => decoder.read(room),
             };
             match result {
                 Ok(0) => break,

@@ -8,7 +8,7 @@ use std::path::PathBuf;
 use std::sync::atomic::{AtomicU64, Ordering};
 
 use bytemuck::Pod;
-use memmap2::{Mmap, MmapOptions};
+use memmap2::{Mmap, MmapMut, MmapOptions};
 
 /// Elements of a chunk: a power of two, and large enough that a chunk of any element size is whole pages (4 bytes x 2^16 = 64 pages).
 const CHUNK: usize = 1 << 16;
@@ -33,16 +33,16 @@ impl Budget {
         self.length
     }
 
-    /// Takes memory that is not in an array; false if it is not there.
-    pub fn take(&mut self, bytes: u64) -> bool {
+    /// Takes memory; false if it is not there.
+    fn take(&mut self, bytes: u64) -> bool {
         let fits = bytes <= self.left;
         self.left -= if fits { bytes } else { 0 };
         fits
     }
 
-    /// Writes a chunk to the file and maps it.
-    fn spill(&mut self, bytes: &[u8]) -> io::Result<Mmap> {
-        let Some(left) = self.spill_left.checked_sub(bytes.len() as u64) else {
+    /// The file, for so many bytes more.
+    fn file(&mut self, bytes: u64) -> io::Result<&mut File> {
+        let Some(left) = self.spill_left.checked_sub(bytes) else {
             return Err(io::Error::other("the vertex arrays exceed the memory budget and the limit of the spill file"));
         };
         self.spill_left = left;
@@ -50,12 +50,34 @@ impl Budget {
             self.file = Some(temporary_file(&self.folder)?);
         }
         let Some(file) = &mut self.file else { unreachable!("made above") };
+        Ok(file)
+    }
+
+    /// Writes a chunk to the file and maps it.
+    fn spill(&mut self, bytes: &[u8]) -> io::Result<Mmap> {
+        let at = self.length;
+        let file = self.file(bytes.len() as u64)?;
         file.write_all(bytes)?;
         // SAFETY: the file has no name any more, so that no other process can reach it; this process only appends to it, and
         // never truncates it, so the mapped range stays as it is. Its bytes were written (not sparse), so that a full disk is
         // an error of write and no fault of a read.
-        let map = unsafe { MmapOptions::new().offset(self.length).len(bytes.len()).map(&*file)? };
+        let map = unsafe { MmapOptions::new().offset(at).len(bytes.len()).map(&*file)? };
         self.length += bytes.len() as u64;
+        Ok(map)
+    }
+
+    /// Writes so many zeros to the file and maps them, to be changed.
+    fn spill_zeros(&mut self, bytes: u64) -> io::Result<MmapMut> {
+        const ZEROS: [u8; 1 << 16] = [0; 1 << 16];
+        // whole pages, so that what comes after begins at a page again
+        let (at, whole) = (self.length, bytes.next_multiple_of(ZEROS.len() as u64));
+        let file = self.file(whole)?;
+        for _ in 0..whole / ZEROS.len() as u64 {
+            file.write_all(&ZEROS)?;
+        }
+        // SAFETY: as in `spill`; and no other map covers this range, so that the one who gets this one alone reads and changes it.
+        let map = unsafe { MmapOptions::new().offset(at).len(bytes as usize).map_mut(&*file)? };
+        self.length += whole;
         Ok(map)
     }
 }
@@ -131,6 +153,39 @@ impl<T: Pod> Column<T> {
     }
 }
 
+/// An array of fixed length that is changed at random.
+pub(super) enum Table<T> {
+    Memory(Vec<T>),
+    Mapped(MmapMut),
+}
+
+impl<T: Pod> Table<T> {
+    /// All zeros.
+    pub fn zeroed(len: usize, budget: &mut Budget) -> io::Result<Self> {
+        let bytes = (len * size_of::<T>()) as u64;
+        Ok(match budget.take(bytes) {
+            true => Table::Memory(vec![T::zeroed(); len]),
+            false => Table::Mapped(budget.spill_zeros(bytes)?),
+        })
+    }
+
+    /// All elements.
+    pub fn values(&self) -> &[T] {
+        match self {
+            Table::Memory(values) => values,
+            Table::Mapped(map) => bytemuck::cast_slice(map),
+        }
+    }
+
+    /// All elements, to be changed.
+    pub fn values_mut(&mut self) -> &mut [T] {
+        match self {
+            Table::Memory(values) => values,
+            Table::Mapped(map) => bytemuck::cast_slice_mut(map),
+        }
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -152,6 +207,29 @@ mod tests {
             assert_eq!(column.get(n), None);
             assert_eq!(column.get(usize::MAX), None);
         }
+    }
+
+    #[test]
+    fn a_table_that_spills_holds_what_is_put_into_it() {
+        for memory in [u64::MAX, 0] {
+            let mut budget = Budget::new(memory, u64::MAX, std::env::temp_dir());
+            let mut column = Column::new();
+            let n = 3 * CHUNK + 11;
+            let mut table = Table::<[f64; 3]>::zeroed(n, &mut budget).unwrap();
+            for i in (0..n).rev().step_by(7) {
+                table.values_mut()[i][1] += i as f64;
+            }
+            // what comes after it in the file does not touch it
+            (0..2 * CHUNK).for_each(|i| column.push(i as u32, &mut budget).unwrap());
+            assert_eq!(budget.spilled() > 0, memory == 0);
+            for (i, v) in table.values().iter().enumerate() {
+                let want = if (n - 1 - i).is_multiple_of(7) { i as f64 } else { 0.0 };
+                assert_eq!(*v, [0.0, want, 0.0]);
+            }
+            assert_eq!(column.get(CHUNK + 3), Some(CHUNK as u32 + 3));
+        }
+        assert!(Table::<u64>::zeroed(10, &mut Budget::new(0, 100, std::env::temp_dir())).is_err());
+        assert_eq!(Table::<u64>::zeroed(0, &mut Budget::new(0, 0, std::env::temp_dir())).unwrap().values(), [0; 0]);
     }
 
     #[test]

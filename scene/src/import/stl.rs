@@ -158,25 +158,33 @@ impl StlReader {
 }
 
 impl TriangleReader for StlReader {
-    fn next(&mut self) -> Result<Option<Corners>, ImportError> {
+    type Triangle = [[f64; 3]; 3];
+
+    fn next(&mut self) -> Result<Option<[[f64; 3]; 3]>, ImportError> {
         let p = match self.format {
             Format::Ascii { .. } => self.next_ascii()?,
             Format::Binary { count } if self.done == count => None,
             Format::Binary { .. } => Some(self.next_binary()?),
         };
         self.done += u64::from(p.is_some());
-        Ok(p.map(|p| Corners { p, n: None, uv: None, vertices: [0; 3] }))
+        Ok(p)
     }
 
-    fn rewind(&mut self) -> Result<(), ImportError> {
-        self.done = 0;
-        match &mut self.format {
-            Format::Ascii { fan, .. } => {
-                *fan = None;
-                self.source.seek(0, 1)
-            }
-            Format::Binary { .. } => self.source.seek(HEAD, 0),
-        }
+    fn corners(&self, p: &[[f64; 3]; 3]) -> Corners {
+        Corners { p: *p, n: None, uv: None }
+    }
+
+    fn has_normals(&self, _: &[[f64; 3]; 3]) -> bool {
+        false
+    }
+
+    /// No vertex is shared, and nothing is smoothed: none has a number.
+    fn vertices(_: &[[f64; 3]; 3]) -> [usize; 3] {
+        [0; 3]
+    }
+
+    fn vertex_count(&self) -> usize {
+        1
     }
 
     fn source(&self) -> &Source {

@@ -51,16 +51,24 @@ impl<'a> DescriptionSource<'a> {
         DescriptionSource { description, options, spilled: AtomicU64::new(0), volumes }
     }
 
-    /// The surface of a volume; its headers are read once for all passes.
-    fn surface(&self, number: usize, path: &Path, iso: f64, shape: &Shape) -> Result<&IsoSurfaceSource, ImportError> {
+    /// The surface of a volume; its headers are read once for all passes. And the bytes that were read for it now.
+    fn surface(
+        &self,
+        number: usize,
+        path: &Path,
+        iso: f64,
+        shape: &Shape,
+    ) -> Result<(&IsoSurfaceSource, u64), ImportError> {
         let Some(slot) = &self.volumes[number] else { unreachable!("made for each surface of a volume") };
+        let mut read = 0;
         if slot.get().is_none() {
             let source = IsoSurfaceSource::new(path, iso)?.placed(&shape.to_world, number as u32);
+            read = source.file().header_bytes();
             // two passes that begin at once read the headers twice; the first to finish is kept
             let _ = slot.set(source);
         }
         let Some(source) = slot.get() else { unreachable!("set above") };
-        Ok(source)
+        Ok((source, read))
     }
 
     /// Bytes of vertex arrays that went to temporary files, over all passes so far.
@@ -70,11 +78,16 @@ impl<'a> DescriptionSource<'a> {
 
     /// A pass over one shape.
     pub(super) fn open_one(&self, number: usize) -> Result<Box<dyn RecordStream + '_>, ImportError> {
-        self.open_shape(number, &self.description.shapes[number])
+        self.open_shape(number, &self.description.shapes[number], true)
     }
 
-    /// The records of one shape.
-    fn open_shape(&self, number: usize, shape: &'a Shape) -> Result<Box<dyn RecordStream + '_>, ImportError> {
+    /// The records of one shape. Smooth normals are what costs: every triangle of a mesh must be read before the first is known.
+    fn open_shape(
+        &self,
+        number: usize,
+        shape: &'a Shape,
+        normals: bool,
+    ) -> Result<Box<dyn RecordStream + '_>, ImportError> {
         let number = number as u32;
         let placement = Placement::new(shape, number);
         Ok(match &shape.geometry {
@@ -83,13 +96,14 @@ impl<'a> DescriptionSource<'a> {
             }
             Geometry::Sphere { center, radius } => Box::new(Once(Some(sphere(shape, number, *center, *radius)))),
             Geometry::MeshFile { path, format, flip_v, smooth } => {
-                let options = MeshOptions { placement, flip_v: *flip_v, smooth: *smooth, spilled: &self.spilled };
+                let smooth = *smooth && normals;
+                let options = MeshOptions { placement, flip_v: *flip_v, smooth, spilled: &self.spilled };
                 match format {
                     MeshFormat::Ply => Box::new(MeshStream::new(PlyReader::open(path, &self.options)?, options)?),
                     MeshFormat::Obj => Box::new(MeshStream::new(ObjReader::open(path, &self.options)?, options)?),
                     MeshFormat::Serialized(index) => {
                         let reader = SerializedReader::open(path, *index, &self.options)?;
-                        let options = MeshOptions { smooth: *smooth && !reader.face_normals(), ..options };
+                        let options = MeshOptions { smooth: smooth && !reader.face_normals(), ..options };
                         Box::new(MeshStream::new(reader, options)?)
                     }
                     MeshFormat::Stl => {
@@ -100,7 +114,8 @@ impl<'a> DescriptionSource<'a> {
                 }
             }
             Geometry::IsoSurface { path, iso } => {
-                let records = self.surface(number as usize, path, *iso, shape)?.open()?;
+                let (surface, read) = self.surface(number as usize, path, *iso, shape)?;
+                let records = Box::new(surface.stream()?.after(read));
                 if shape.flip_normals { Box::new(Flipped(records)) } else { records }
             }
         })
@@ -109,12 +124,16 @@ impl<'a> DescriptionSource<'a> {
 
 impl RecordSource for DescriptionSource<'_> {
     fn open(&self) -> Result<Box<dyn RecordStream + '_>, ImportError> {
-        Ok(Box::new(DescriptionStream { source: self, shape: 0, current: None, bytes_read: 0 }))
+        Ok(Box::new(DescriptionStream { source: self, normals: true, shape: 0, current: None, bytes_read: 0 }))
+    }
+    fn open_places(&self) -> Result<Box<dyn RecordStream + '_>, ImportError> {
+        Ok(Box::new(DescriptionStream { source: self, normals: false, shape: 0, current: None, bytes_read: 0 }))
     }
 }
 
 struct DescriptionStream<'a> {
     source: &'a DescriptionSource<'a>,
+    normals: bool,
     /// The shape after the current one.
     shape: usize,
     current: Option<Box<dyn RecordStream + 'a>>,
@@ -135,7 +154,7 @@ impl RecordStream for DescriptionStream<'_> {
                     n => appended += n,
                 }
             } else if let Some(shape) = self.source.description.shapes.get(self.shape) {
-                self.current = Some(self.source.open_shape(self.shape, shape)?);
+                self.current = Some(self.source.open_shape(self.shape, shape, self.normals)?);
                 self.shape += 1;
             } else {
                 break;

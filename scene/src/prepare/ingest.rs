@@ -12,7 +12,7 @@ use crate::description::Description;
 use crate::grid::count::{Box3, box_of};
 use crate::grid::lattice::{round_down, round_up};
 use crate::manifest::Counts;
-use crate::record::{Record, RecordSource, SphereRecord, TriangleRecord};
+use crate::record::{Record, RecordSource, RecordStream, SphereRecord, TriangleRecord};
 
 /// Records asked for at a time.
 const BATCH: usize = 4096;
@@ -70,14 +70,13 @@ enum Skip {
     OutOfRange,
 }
 
-/// Shows every record of a source to `see`, in order; the bytes that were read for it.
+/// Shows every record of a pass to `see`, in order; the bytes that were read for it.
 fn each(
-    source: &dyn RecordSource,
+    mut stream: Box<dyn RecordStream + '_>,
     stage: Stage,
     progress: &dyn PrepareProgress,
     mut see: impl FnMut(&Record) -> Result<(), PrepareError>,
 ) -> Result<u64, PrepareError> {
-    let mut stream = source.open()?;
     progress.begin(stage, None);
     let mut batch = Vec::with_capacity(BATCH);
     loop {
@@ -97,7 +96,7 @@ pub(crate) fn bounds(
     progress: &dyn PrepareProgress,
 ) -> Result<Option<SourceBounds>, PrepareError> {
     let (mut lo, mut hi) = ([f64::INFINITY; 3], [f64::NEG_INFINITY; 3]);
-    let bytes = each(source, Stage::Bounds, progress, |record| {
+    let bytes = each(source.open_places()?, Stage::Bounds, progress, |record| {
         let mut add = |p: [f64; 3], r: f64| {
             for a in 0..3 {
                 lo[a] = lo[a].min(p[a] - r);
@@ -139,7 +138,7 @@ pub(crate) fn ingest(
         emissive: Vec::new(),
         hashers: Default::default(),
     };
-    reader.counts.source_bytes = each(source, Stage::Reading, progress, |record| reader.add(record))?;
+    reader.counts.source_bytes = each(source.open()?, Stage::Reading, progress, |record| reader.add(record))?;
     reader.flush()?;
     let mut hasher = blake3::Hasher::new();
     for part in &reader.hashers {

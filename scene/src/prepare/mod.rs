@@ -246,11 +246,11 @@ fn read(
 ) -> Result<([f64; 3], Ingested), PrepareError> {
     let known = description.bounds.filter(ingest::usable_bounds);
     let (lo, hi, bytes) = match known {
-        Some([lo, hi]) => (lo, hi, description.bytes_read),
+        Some([lo, hi]) => (lo, hi, 0),
         None => match ingest::bounds(source, progress)? {
-            Some(found) => (found.lo, found.hi, found.bytes + description.bytes_read),
+            Some(found) => (found.lo, found.hi, found.bytes),
             // nothing usable: the pass below counts why
-            None => ([0.0; 3], [0.0; 3], description.bytes_read),
+            None => ([0.0; 3], [0.0; 3], 0),
         },
     };
     let offset = std::array::from_fn(|a| 0.5 * (lo[a] + hi[a]));
@@ -261,8 +261,8 @@ fn read(
     if triangles + spheres == 0 || (meant_dark && !ingested.has_dark()) {
         return Err(PrepareError::Empty { records, degenerate, non_finite, out_of_range });
     }
-    ingested.counts.source_reads = 2;
-    ingested.counts.source_bytes += bytes;
+    ingested.counts.source_reads = description.passes + u32::from(known.is_none()) + 1;
+    ingested.counts.source_bytes += bytes + description.bytes_read;
     Ok((offset, ingested))
 }
 

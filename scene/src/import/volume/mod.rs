@@ -16,8 +16,8 @@ use std::path::Path;
 
 use crate::ImportError;
 use crate::description::Affine;
-use crate::import::regular;
 use layout::Layout;
+use slices::{Bytes, Counted};
 pub use layout::SampleType;
 pub use slices::Slices;
 
@@ -70,7 +70,7 @@ impl VolumeFile {
     pub fn volume(&self) -> &Volume {
         &self.volume
     }
-    /// Bytes that were read to open it.
+    /// Bytes that were read to open it, those that told the format among them.
     pub fn header_bytes(&self) -> u64 {
         self.header_bytes
     }
@@ -87,13 +87,13 @@ pub fn is_volume(path: &Path) -> Result<bool, ImportError> {
         let io = |source| ImportError::Io { path: path.to_owned(), source };
         for entry in std::fs::read_dir(path).map_err(io)? {
             let file = entry.map_err(io)?.path();
-            if file.is_file() && matches!(format(&file)?, Some(Format::Dicom)) {
+            if file.is_file() && matches!(format(&file, &Bytes::default())?, Some(Format::Dicom)) {
                 return Ok(true);
             }
         }
         return Ok(false);
     }
-    Ok(format(path)?.is_some())
+    Ok(format(path, &Bytes::default())?.is_some())
 }
 
 /// Opens a volume: an NRRD, NHDR or NIfTI file (also gzipped), a folder with a DICOM series, or one DICOM file, which
@@ -103,15 +103,18 @@ pub fn is_volume(path: &Path) -> Result<bool, ImportError> {
 /// # Errors
 /// What cannot be read, is malformed or not supported, with the file that is to blame.
 pub fn open(path: &Path) -> Result<VolumeFile, ImportError> {
-    if path.is_dir() {
-        return dicom::open_folder(path);
-    }
-    match format(path)? {
-        Some(Format::Nrrd) => nrrd::open(path),
-        Some(Format::Nifti(header)) => nifti::open(path, &header),
-        Some(Format::Dicom) => dicom::open_file(path),
-        None => Err(malformed(path, 0, "not a volume: neither NRRD nor NIfTI nor DICOM by its content")),
-    }
+    let bytes = Bytes::default();
+    let (volume, layout) = if path.is_dir() {
+        dicom::open_folder(path, &bytes)?
+    } else {
+        match format(path, &bytes)? {
+            Some(Format::Nrrd) => nrrd::open(path, &bytes)?,
+            Some(Format::Nifti(header)) => nifti::open(path, &header)?,
+            Some(Format::Dicom) => dicom::open_file(path, &bytes)?,
+            None => return Err(malformed(path, 0, "not a volume: neither NRRD nor NIfTI nor DICOM by its content")),
+        }
+    };
+    Ok(VolumeFile { volume, layout, header_bytes: bytes.get() })
 }
 
 enum Format {
@@ -120,20 +123,20 @@ enum Format {
     Dicom,
 }
 
-fn format(path: &Path) -> Result<Option<Format>, ImportError> {
+fn format(path: &Path, bytes: &Bytes) -> Result<Option<Format>, ImportError> {
     let io = |source| ImportError::Io { path: path.to_owned(), source };
     if !std::fs::metadata(path).map_err(io)?.is_file() {
         return Ok(None); // opening a pipe would wait for ever
     }
     let mut first = Vec::new();
-    regular::open(path).map_err(io)?.0.take(132).read_to_end(&mut first).map_err(io)?;
+    Counted::open(path, bytes).map_err(io)?.take(132).read_to_end(&mut first).map_err(io)?;
     if first.starts_with(b"NRRD000") {
         return Ok(Some(Format::Nrrd));
     }
     if dicom::is_dicom(&first) {
         return Ok(Some(Format::Dicom));
     }
-    Ok(nifti::recognise(path).map_err(io)?.map(Format::Nifti))
+    Ok(nifti::recognise(path, bytes).map_err(io)?.map(Format::Nifti))
 }
 
 /// An error of the content.

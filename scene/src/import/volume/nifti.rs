@@ -7,10 +7,10 @@ use std::path::Path;
 use flate2::bufread::MultiGzDecoder;
 
 use super::layout::{Layout, Part, Skip, check_dims};
-use super::{SampleType, Volume, VolumeFile, malformed};
+use super::slices::{Bytes, Counted};
+use super::{SampleType, Volume, malformed};
 use crate::ImportError;
 use crate::description::Affine;
-use crate::import::regular;
 
 const SIZE_1: usize = 348;
 const SIZE_2: usize = 540;
@@ -20,13 +20,11 @@ pub(super) struct Header {
     bytes: Vec<u8>,
     big_endian: bool,
     gzip: bool,
-    /// Bytes read from the file for it.
-    read: u64,
 }
 
 /// Looks whether a file is a NIfTI file.
-pub(super) fn recognise(path: &Path) -> io::Result<Option<Header>> {
-    let mut reader = BufReader::new(regular::open(path)?.0);
+pub(super) fn recognise(path: &Path, read: &Bytes) -> io::Result<Option<Header>> {
+    let mut reader = BufReader::new(Counted::open(path, read)?);
     let gzip = io::BufRead::fill_buf(&mut reader)?.starts_with(&[0x1f, 0x8b]);
     let mut bytes = Vec::new();
     if gzip {
@@ -56,8 +54,7 @@ pub(super) fn recognise(path: &Path) -> io::Result<Option<Header>> {
         (_, true) => true,
         _ => return Ok(None),
     };
-    let read = bytes.len() as u64;
-    Ok(Some(Header { bytes, big_endian, gzip, read }))
+    Ok(Some(Header { bytes, big_endian, gzip }))
 }
 
 impl Header {
@@ -139,7 +136,7 @@ struct Fields {
     rows: [[f64; 4]; 3],
 }
 
-pub(super) fn open(path: &Path, header: &Header) -> Result<VolumeFile, ImportError> {
+pub(super) fn open(path: &Path, header: &Header) -> Result<(Volume, Layout), ImportError> {
     let f = header.fields();
     let fail = |message: String| Err(malformed(path, 0, message));
     let used = match f.dim[0] {
@@ -200,7 +197,7 @@ pub(super) fn open(path: &Path, header: &Header) -> Result<VolumeFile, ImportErr
     };
     layout.check(path)?;
     let volume = Volume { dims, to_world: placement(path, &f)?, slope, intercept, sample, skipped_files: 0 };
-    Ok(VolumeFile { volume, layout, header_bytes: header.read })
+    Ok((volume, layout))
 }
 
 /// By the standard: sform if there is one, else qform, else the spacing alone. RAS becomes LPS.

@@ -4,10 +4,10 @@ use std::io::{BufRead, BufReader, Read};
 use std::path::{Component, Path, PathBuf};
 
 use super::layout::{Layout, Part, Skip, check_dims};
-use super::{SampleType, Volume, VolumeFile, malformed};
+use super::slices::{Bytes, Counted};
+use super::{SampleType, Volume, malformed};
 use crate::ImportError;
 use crate::description::Affine;
-use crate::import::regular;
 
 /// Longest header: room for a list of many thousand files.
 const MAX_HEADER: u64 = 1 << 20;
@@ -59,9 +59,9 @@ struct Header {
     data: Option<(u32, Vec<String>)>,
 }
 
-pub(super) fn open(path: &Path) -> Result<VolumeFile, ImportError> {
+pub(super) fn open(path: &Path, bytes: &Bytes) -> Result<(Volume, Layout), ImportError> {
     let io = |source| ImportError::Io { path: path.to_owned(), source };
-    let mut reader = BufReader::new(regular::open(path).map_err(io)?.0.take(MAX_HEADER + 1));
+    let mut reader = BufReader::new(Counted::open(path, bytes).map_err(io)?.take(MAX_HEADER + 1));
     let mut text = Vec::new();
     let mut h = Header::default();
     let mut line = 0;
@@ -276,8 +276,8 @@ fn numbered(format: &str, n: i64) -> Result<String, String> {
     Ok(if spec.starts_with('0') { format!("{before}{n:0width$}{after}") } else { format!("{before}{n:width$}{after}") })
 }
 
-/// `lines` are those of the header, its closing empty line included.
-fn finish(path: &Path, h: Header, header_bytes: u64, lines: u64) -> Result<VolumeFile, ImportError> {
+/// `length` and `lines` are those of the header, its closing empty line included.
+fn finish(path: &Path, h: Header, length: u64, lines: u64) -> Result<(Volume, Layout), ImportError> {
     let need = |name: &str| malformed(path, 0, format!("the header has no field `{name}`"));
     if h.dimension.ok_or_else(|| need("dimension"))? != 3 {
         return Err(malformed(path, 0, "the dimension is not 3: cut a volume out first (`unu slice`)"));
@@ -302,7 +302,7 @@ fn finish(path: &Path, h: Header, header_bytes: u64, lines: u64) -> Result<Volum
         // attached: what is to be skipped comes after the header
         None => {
             let skip = match skip {
-                Skip::Lines(0, n) if !gzip => Skip::Lines(0, header_bytes.saturating_add(n)),
+                Skip::Lines(0, n) if !gzip => Skip::Lines(0, length.saturating_add(n)),
                 Skip::FromEnd => Skip::FromEnd,
                 Skip::Lines(more, n) => Skip::Lines(lines.saturating_add(more), n),
             };
@@ -327,7 +327,7 @@ fn finish(path: &Path, h: Header, header_bytes: u64, lines: u64) -> Result<Volum
     layout.check(path)?;
     let to_world = placement(path, &h)?;
     let volume = Volume { dims, to_world, slope: 1.0, intercept: 0.0, sample, skipped_files: 0 };
-    Ok(VolumeFile { volume, layout, header_bytes })
+    Ok((volume, layout))
 }
 
 /// A data file, which must not leave the header's folder, by links neither.

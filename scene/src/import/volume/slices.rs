@@ -3,6 +3,7 @@
 use std::cell::Cell;
 use std::fs::File;
 use std::io::{self, BufRead, BufReader, Read, Seek, SeekFrom};
+use std::path::Path;
 use std::rc::Rc;
 
 use flate2::bufread::MultiGzDecoder;
@@ -20,7 +21,7 @@ pub struct Slices<'a> {
     done: usize,
     reader: Option<Box<dyn Read>>,
     raw: Vec<u8>,
-    bytes: Rc<Cell<u64>>,
+    bytes: Bytes,
 }
 
 impl<'a> Slices<'a> {
@@ -75,10 +76,20 @@ impl<'a> Slices<'a> {
     }
 }
 
+/// Bytes read from some files together.
+pub(super) type Bytes = Rc<Cell<u64>>;
+
 /// Counts what is read from a file.
 pub(super) struct Counted {
-    pub file: File,
-    pub bytes: Rc<Cell<u64>>,
+    file: File,
+    bytes: Bytes,
+}
+
+impl Counted {
+    /// Opens a regular file.
+    pub fn open(path: &Path, bytes: &Bytes) -> io::Result<Self> {
+        Ok(Counted { file: regular::open(path)?.0, bytes: bytes.clone() })
+    }
 }
 
 impl Seek for Counted {
@@ -96,22 +107,23 @@ impl Read for Counted {
 }
 
 /// A reader at the part's first sample.
-fn open_part(part: &Part, layout: &Layout, bytes: &Rc<Cell<u64>>) -> io::Result<Box<dyn Read>> {
-    let (mut file, metadata) = regular::open(&part.path)?;
+fn open_part(part: &Part, layout: &Layout, bytes: &Bytes) -> io::Result<Box<dyn Read>> {
+    let mut file = Counted::open(&part.path, bytes)?;
     let need = layout.slice_bytes() as u64 * part.slices as u64;
     let (lines, skip) = match part.skip {
         Skip::Lines(lines, skip) => (lines, skip),
         Skip::FromEnd => {
-            let start = metadata.len().checked_sub(need).ok_or(io::ErrorKind::UnexpectedEof)?;
+            let start = file.seek(SeekFrom::End(0))?.checked_sub(need).ok_or(io::ErrorKind::UnexpectedEof)?;
             (0, start)
         }
     };
     if lines == 0 && !part.gzip {
         // no buffer: slices are large, and nothing beyond them is read
         file.seek(SeekFrom::Start(skip))?;
-        return Ok(Box::new(Counted { file, bytes: bytes.clone() }));
+        return Ok(Box::new(file));
     }
-    let mut reader = BufReader::new(Counted { file, bytes: bytes.clone() });
+    file.rewind()?;
+    let mut reader = BufReader::new(file);
     for _ in 0..lines {
         reader.skip_until(b'\n')?;
     }

@@ -2,19 +2,16 @@
 
 mod element;
 
-use std::cell::Cell;
 use std::collections::BTreeMap;
 use std::io::BufReader;
 use std::path::{Path, PathBuf};
-use std::rc::Rc;
 
 use element::{DataSet, Failure, Tag};
 
 use super::layout::{Layout, Part, Skip, check_dims};
-use super::slices::Counted;
-use super::{SampleType, Volume, VolumeFile, malformed};
+use super::slices::{Bytes, Counted};
+use super::{SampleType, Volume, malformed};
 use crate::ImportError;
-use crate::import::regular;
 
 const SERIES_DESCRIPTION: Tag = (0x0008, 0x103e);
 const SERIES: Tag = (0x0020, 0x000e);
@@ -97,8 +94,8 @@ pub(super) fn is_dicom(first: &[u8]) -> bool {
 }
 
 /// Opens the series in a folder, which must be the only one there.
-pub(super) fn open_folder(folder: &Path) -> Result<VolumeFile, ImportError> {
-    let scan = scan(folder)?;
+pub(super) fn open_folder(folder: &Path, bytes: &Bytes) -> Result<(Volume, Layout), ImportError> {
+    let scan = scan(folder, bytes)?;
     let mut series: BTreeMap<&str, Vec<&Found>> = BTreeMap::new();
     for image in &scan.images {
         series.entry(&image.series).or_default().push(image);
@@ -133,13 +130,12 @@ pub(super) fn open_folder(folder: &Path) -> Result<VolumeFile, ImportError> {
 }
 
 /// Opens the series that one file belongs to: those of its folder with the same series number.
-pub(super) fn open_file(path: &Path) -> Result<VolumeFile, ImportError> {
-    let bytes = Rc::default();
-    let Some(image) = read(path, &bytes)? else {
+pub(super) fn open_file(path: &Path, bytes: &Bytes) -> Result<(Volume, Layout), ImportError> {
+    let Some(image) = read(path, bytes)? else {
         return Err(malformed(path, 0, "this DICOM file holds no image"));
     };
     let folder = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
-    let mut scan = scan(folder)?;
+    let mut scan = scan(folder, bytes)?;
     scan.images.retain(|i| i.series == image.series);
     assemble(folder, scan)
 }
@@ -148,10 +144,9 @@ struct Scan {
     images: Vec<Found>,
     others: usize,
     folders: usize,
-    bytes: u64,
 }
 
-fn scan(folder: &Path) -> Result<Scan, ImportError> {
+fn scan(folder: &Path, bytes: &Bytes) -> Result<Scan, ImportError> {
     let io = |source| ImportError::Io { path: folder.to_owned(), source };
     let mut names = Vec::new();
     let mut folders = 0;
@@ -164,25 +159,24 @@ fn scan(folder: &Path) -> Result<Scan, ImportError> {
         }
     }
     names.sort();
-    let bytes = Rc::default();
     let mut images = Vec::new();
     let mut others = 0;
     for path in names {
-        match read(&path, &bytes)? {
+        match read(&path, bytes)? {
             Some(image) => images.push(image),
             None => others += 1,
         }
     }
-    Ok(Scan { images, others, folders, bytes: Cell::get(&bytes) })
+    Ok(Scan { images, others, folders })
 }
 
 /// Reads one file's header; none if it is no DICOM file, or none of an image (a directory, a report).
-fn read(path: &Path, bytes: &Rc<Cell<u64>>) -> Result<Option<Found>, ImportError> {
+fn read(path: &Path, bytes: &Bytes) -> Result<Option<Found>, ImportError> {
     let io = |source| ImportError::Io { path: path.to_owned(), source };
     if !std::fs::metadata(path).map_err(io)?.is_file() {
         return Ok(None); // opening a pipe would wait for ever
     }
-    let file = Counted { file: regular::open(path).map_err(io)?.0, bytes: bytes.clone() };
+    let file = Counted::open(path, bytes).map_err(io)?;
     // headers of a slice have some 2 KB, and what is read beyond them is read again in each pass
     match element::read(BufReader::with_capacity(2048, file), WANTED) {
         Ok(Some(set)) if set.pixels.is_some() => {
@@ -291,7 +285,7 @@ fn dot(a: [f64; 3], b: [f64; 3]) -> f64 {
 }
 
 /// A volume from the images of one series.
-fn assemble(folder: &Path, scan: Scan) -> Result<VolumeFile, ImportError> {
+fn assemble(folder: &Path, scan: Scan) -> Result<(Volume, Layout), ImportError> {
     let mut images = Vec::with_capacity(scan.images.len());
     for Found { path, set, .. } in scan.images {
         let set = meaning(&set).map_err(|message| malformed(&path, 0, message))?;
@@ -362,7 +356,7 @@ fn assemble(folder: &Path, scan: Scan) -> Result<VolumeFile, ImportError> {
     };
     layout.check(folder)?;
     let volume = Volume { dims, to_world, slope, intercept, sample: f.sample, skipped_files: scan.others };
-    Ok(VolumeFile { volume, layout, header_bytes: scan.bytes })
+    Ok((volume, layout))
 }
 
 /// Sorted images must lie evenly on a line.
