@@ -33,13 +33,20 @@ pub struct Resident {
     reading: Mutex<()>,
 }
 
-/// Room in a forest's arena for its top tree, a block: two trees of some 20 KiB, and alignment.
-const TOP_BYTES: u64 = 64 << 10;
+/// Room in a forest's arena for what its top tree takes of a block of so many primitives: two trees of some 20 KiB, and
+/// alignment. A block of few primitives is opened into no more entries than it has, and a node (256 bytes) has two at least.
+pub(crate) fn top_bytes(primitives: u64) -> u64 {
+    (primitives.max(1) * 256).min(64 << 10)
+}
+
+/// Largest forest that a task can hold (see [`Forest`]).
+pub(crate) const FOREST_BYTES: u64 = 8 << 30;
 
 impl Resident {
     /// Reads and checks the geometry of the splits.
     pub fn load(scene: &PreparedScene, splits: &[u32], blocks: &dyn Blocks) -> Result<Self, JobError> {
-        let bytes: u64 = splits.iter().map(|&s| scene.manifest.splits[s as usize].geometry.bytes + TOP_BYTES).sum();
+        let entries = splits.iter().map(|&s| &scene.manifest.splits[s as usize]);
+        let bytes: u64 = entries.map(|e| e.geometry.bytes + top_bytes(e.triangles + e.spheres)).sum();
         let first = splits.first().copied().unwrap_or(0);
         let mut forest = Forest::new(bytes).map_err(|source| JobError::Forest { split: first, source })?;
         let mut handles = Vec::with_capacity(splits.len());
@@ -75,10 +82,16 @@ impl Resident {
         self.blocks[self.block_of(slot)].1
     }
     /// To be shaded: reads the attributes when they are asked for first.
-    pub fn surfaces(&self, scene: &PreparedScene, blocks: &dyn Blocks) -> Result<ResidentSurfaces<'_>, JobError> {
+    fn surfaces(
+        &self,
+        scene: &PreparedScene,
+        blocks: &dyn Blocks,
+        memory: &Memory,
+    ) -> Result<ResidentSurfaces<'_>, JobError> {
         if self.attributes.get().is_none() {
             let _one = lock(&self.reading);
             if self.attributes.get().is_none() {
+                let _alone = memory.loading();
                 let read = self.blocks.iter().map(|&(_, split)| {
                     let entry = &scene.manifest.splits[split as usize];
                     let bytes = blocks.attributes(split)?;
@@ -108,26 +121,41 @@ impl Resident {
 /// primitive misses the last one at each hit.
 const RUNS: usize = 256;
 
-/// Attributes of a split, with a short way to a primitive's shape.
+/// Attributes of a split, with a short way to a primitive's shape. They take no more memory than the object: runs of shapes as there,
+/// or a number for each primitive when these are fewer bytes.
 struct Attributes {
+    /// Without shapes where runs serve.
     block: AttributeBlock,
-    /// First primitive of each run but the first, when there are few.
+    /// First primitive of each run but the first.
     starts: Option<Vec<u32>>,
+    /// Shape of each run.
     shapes: Vec<u32>,
 }
 
 impl Attributes {
-    fn new(block: AttributeBlock) -> Self {
-        let runs: Vec<&[u32]> = block.shapes.chunk_by(|a, b| a == b).take(RUNS + 1).collect();
-        if runs.len() > RUNS {
+    fn new(mut block: AttributeBlock) -> Self {
+        let runs = block.shapes.chunk_by(|a, b| a == b).count();
+        if runs > RUNS && 2 * runs > block.shapes.len() {
             return Attributes { block, starts: None, shapes: Vec::new() };
         }
-        let ends = runs.iter().scan(0, |at, run| {
-            *at += run.len() as u32;
-            Some(*at)
-        });
-        let (starts, shapes) = (ends.take(runs.len().saturating_sub(1)).collect(), runs.iter().map(|r| r[0]).collect());
+        let (mut starts, mut shapes) = (Vec::with_capacity(runs.saturating_sub(1)), Vec::with_capacity(runs));
+        let mut at = 0;
+        for run in block.shapes.chunk_by(|a, b| a == b) {
+            shapes.push(run[0]);
+            at += run.len();
+            if at < block.shapes.len() {
+                starts.push(at as u32);
+            }
+        }
+        block.shapes = Vec::new();
         Attributes { block, starts: Some(starts), shapes }
+    }
+
+    #[cfg(test)]
+    fn bytes(&self) -> usize {
+        let AttributeBlock { shapes, normals, uvs } = &self.block;
+        let starts = self.starts.as_ref().map_or(0, Vec::capacity);
+        4 * (shapes.capacity() + starts + self.shapes.capacity()) + 36 * normals.capacity() + 24 * uvs.capacity()
     }
 
     #[inline(always)]
@@ -191,10 +219,14 @@ impl Surfaces for ResidentSurfaces<'_> {
 
 /// The memory of a node: sets of splits that tasks share, within a budget. What no task uses stays until its room is
 /// needed.
+///
+/// An object that is being loaded is there twice for a moment: as it came, and where it is to stay. With a limit, loading is for one
+/// task at a time, so that what comes on top is one object.
 pub struct Memory {
     capacity: u64,
     state: Mutex<State>,
     changed: Condvar,
+    loading: Mutex<()>,
 }
 
 #[derive(Default)]
@@ -222,6 +254,16 @@ pub struct Lease<'a> {
     pub warm: bool,
 }
 
+impl Lease<'_> {
+    /// To be shaded: reads the attributes when they are asked for first.
+    ///
+    /// # Errors
+    /// When they cannot be read, or do not go with the geometry.
+    pub fn surfaces(&self, scene: &PreparedScene, blocks: &dyn Blocks) -> Result<ResidentSurfaces<'_>, JobError> {
+        self.resident.surfaces(scene, blocks, self.memory)
+    }
+}
+
 impl std::ops::Deref for Lease<'_> {
     type Target = Resident;
     fn deref(&self) -> &Resident {
@@ -242,7 +284,11 @@ impl Drop for Lease<'_> {
 impl Memory {
     /// Memory for so many bytes of splits.
     pub fn new(capacity: u64) -> Self {
-        Memory { capacity, state: Mutex::default(), changed: Condvar::new() }
+        Memory { capacity, state: Mutex::default(), changed: Condvar::new(), loading: Mutex::new(()) }
+    }
+    /// Held while objects are loaded.
+    fn loading(&self) -> Option<MutexGuard<'_, ()>> {
+        (self.capacity < u64::MAX).then(|| lock(&self.loading))
     }
     /// What it may hold.
     pub fn capacity(&self) -> u64 {
@@ -307,7 +353,9 @@ impl Memory {
             }
         }
         let mut undo = Undo(Some((self, set)));
+        let one = self.loading();
         let resident = Arc::new(load()?);
+        drop(one);
         undo.0 = None;
         let mut state = lock(&self.state);
         if let Some(held) = state.held.iter_mut().find(|h| h.set == set) {
@@ -344,10 +392,37 @@ mod tests {
     #[test]
     fn shapes_by_runs_are_those_by_number() {
         let runs = |n: usize, len: usize| (0..n * len).map(|i| (i / len) as u32 % 7).collect::<Vec<u32>>();
-        for shapes in [vec![], vec![5], vec![1, 1, 2], runs(RUNS, 3), runs(RUNS + 1, 1), runs(1000, 2)] {
-            let attributes = Attributes::new(AttributeBlock { shapes: shapes.clone(), ..Default::default() });
+        let kinds = [vec![], vec![5], vec![1, 1, 2], runs(RUNS, 3), runs(RUNS + 1, 1), runs(1000, 2), runs(1000, 9)];
+        for shapes in kinds {
+            let block = AttributeBlock { shapes: shapes.clone(), ..Default::default() };
+            // what the object takes is what `--memory` counts
+            let encoded = block.encode().len();
+            let attributes = Attributes::new(AttributeBlock::decode(&block.encode(), shapes.len() as u32).unwrap());
             let found: Vec<u32> = (0..shapes.len()).map(|i| attributes.shape(i)).collect();
             assert_eq!(found, shapes);
+            assert!(attributes.bytes() <= encoded, "{} bytes of an object of {encoded}", attributes.bytes());
         }
+    }
+
+    #[test]
+    fn one_set_is_loaded_at_a_time_where_memory_is_limited() {
+        let loading = std::sync::atomic::AtomicU32::new(0);
+        let memory = Memory::new(100);
+        std::thread::scope(|scope| {
+            for set in 0..8 {
+                let (memory, loading) = (&memory, &loading);
+                scope.spawn(move || {
+                    // fails on purpose: what counts is who was in there with it
+                    let load = || {
+                        let before = loading.fetch_add(1, std::sync::atomic::Ordering::SeqCst);
+                        std::thread::yield_now();
+                        loading.fetch_sub(1, std::sync::atomic::Ordering::SeqCst);
+                        Err(JobError::Internal(before.to_string()))
+                    };
+                    let Err(JobError::Internal(others)) = memory.acquire(&[set], 10, load) else { panic!("it failed") };
+                    assert_eq!(others, "0");
+                });
+            }
+        });
     }
 }

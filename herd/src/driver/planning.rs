@@ -6,9 +6,7 @@ use super::{Driver, Executor, FilmSum};
 use crate::job::NodeSpec;
 use crate::ledger::{Destination, GroupRef};
 use crate::plan::{self, Assignment, NodeView, SplitView, View, Waiting};
-
-/// Largest forest that a task may hold (see `rayherd_render::bvh::Forest`), less room for its top tree.
-const FOREST_BYTES: u64 = (8 << 30) - (64 << 20);
+use crate::resident::FOREST_BYTES;
 
 impl<F: FilmSum> Driver<'_, '_, F> {
     /// What to start now, with the keys of the groups that each takes.
@@ -44,7 +42,7 @@ impl<F: FilmSum> Driver<'_, '_, F> {
             task_camera: self.rate.camera(settings.task_seconds),
             least_rays: u64::from(settings.batch),
             replicas: settings.replicas,
-            forest: FOREST_BYTES,
+            forest: FOREST_BYTES.saturating_sub(self.shared.scene.top_bytes()),
             cut: self.cut.as_deref().unwrap_or_default(),
             traffic: self.traffic,
         };

@@ -15,6 +15,7 @@ use rayherd_scene::objects::ObjectStore;
 
 use super::JobError;
 use crate::plan::place;
+use crate::resident::top_bytes;
 
 /// A prepared scene with its small parts in memory: world, lights, grid. Blocks stay in the store.
 pub struct PreparedScene {
@@ -52,6 +53,15 @@ impl PreparedScene {
         if !manifest.tiles.iter().map(|t| Some(t.bytes)).eq(sizes.by_ref().map(Some)) {
             return Err(broken("its textures have other tiles than the manifest".into()));
         }
+        let most = manifest.grid.cells.iter().map(|c| c.owners.len()).max().unwrap_or(0);
+        // a ray on its way names the owner that it goes to by 16 bits
+        if most > usize::from(u16::MAX) {
+            return Err(JobError::Scene(format!(
+                "a cell of its grid has {most} owners, {} are the most: prepare it with fewer splits or a larger block size, or \
+                 with overlap reduction (strategy scheduling-grid-overlap-reduced or auto)",
+                u16::MAX
+            )));
+        }
         let sky_map = match &manifest.sky_map {
             Some(object) => {
                 let map = SkyMap::decode(&objects.get(object)?);
@@ -75,6 +85,10 @@ impl PreparedScene {
     pub fn split_bytes(&self, split: u32) -> u64 {
         let s = &self.manifest.splits[split as usize];
         s.geometry.bytes + s.attributes.bytes
+    }
+    /// Room that the top trees of all splits take at most, were all of them in one task's memory.
+    pub(crate) fn top_bytes(&self) -> u64 {
+        self.grid.owning().iter().map(|s| &self.manifest.splits[s as usize]).map(|e| top_bytes(e.triangles + e.spheres)).sum()
     }
     /// The splits that rays can need, neighbours in space beside each other: those that own a cell. After overlap
     /// reduction a source split may own none, as all its primitives are in copies.

@@ -73,6 +73,15 @@ pub(crate) fn check(
     if settings.batch == 0 {
         return refuse("a batch has at least one ray".into());
     }
+    // checked here, before any memory is taken: windows are planned in what top trees leave of a task's arena
+    let tops = scene.top_bytes();
+    if tops > FOREST_BYTES / 2 {
+        return refuse(format!(
+            "the scene has {} splits, whose upper nodes alone would fill a task's memory ({tops} bytes of {FOREST_BYTES}): prepare it \
+             with fewer --splits or a larger --block-size",
+            scene.splits()
+        ));
+    }
     let needed = scene.grid.owning().iter().map(|s| scene.split_bytes(s)).max().unwrap_or(0);
     match settings.memory_per_node {
         Some(given) if given < needed => Err(JobError::Memory { needed, given }),
