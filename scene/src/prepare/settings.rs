@@ -75,8 +75,8 @@ pub struct SpoolSettings {
 }
 
 impl Default for SpoolSettings {
-    /// 256 MiB, then the system's temporary folder.
+    /// 64 MiB, about what one split of a scene that is worth a spool takes with its tree; then the system's temporary folder.
     fn default() -> Self {
-        SpoolSettings { memory: 256 << 20, folder: None }
+        SpoolSettings { memory: 64 << 20, folder: None }
     }
 }

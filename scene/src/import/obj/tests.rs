@@ -19,7 +19,7 @@ fn corners_of_all_forms() {
 }
 
 #[test]
-fn smoothing_reads_twice_and_changes_only_normals() {
+fn smoothing_changes_only_normals() {
     let dir = folder();
     let path = write(&dir, "a.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf -3 -2 -1\nv 1 1 0\nf 2 -1 3\n");
     let flat = records(&mesh_shape(&path, MeshFormat::Obj, false)).unwrap();
