@@ -77,7 +77,7 @@ fn assert_error(line: &str, run: &Run, code: i32, parts: &[&str]) {
     assert!(errors == 1, "{line}: {errors} errors in: {told}");
     assert!(told.len() < MOST_TEXT, "{line}: {} bytes of errors: {told}", told.len());
     assert!(!told.contains("panicked") && !told.contains("defect"), "{line}: {told}");
-    for part in *parts {
+    for part in parts {
         assert!(told.contains(part), "{line}: no {part:?} in: {told}");
     }
 }
@@ -121,10 +121,10 @@ fn what_is_missing_empty_cut_or_noise() {
         .write("cut.ply.gz", b"\x1f\x8b\x08\0\0\0\0\0\0\x03");
     bed.mistakes(&[
         ("render cut.stl", &["cut.stl", "2 triangles", "truncated"]),
-        ("render cut-text.stl", &["cut-text.stl:5", "truncated"]),
-        ("render cut.xml", &["cut.xml:2", "not well-formed"]),
+        ("render cut-text.stl", &["cut-text.stl:6", "truncated"]),
+        ("render cut.xml", &["cut.xml:1", "not well-formed", "never closed"]),
         ("render cut.obj", &["cut.obj:2", "needs 3"]),
-        ("render cut.nrrd --iso 5", &["cut.nrrd", "holds 75 bytes", "truncated"]),
+        ("render cut.nrrd --iso 5", &["cut.nrrd", "holds 69 bytes", "truncated"]),
         ("render cut.ply.gz", &["cut.ply.gz", "get the file again"]),
         ("render .", &["."]),
         ("render cut.nrrd", &["cut.nrrd", "--iso VALUE"]),
@@ -135,11 +135,15 @@ fn what_is_missing_empty_cut_or_noise() {
 fn headers_that_claim_more_than_there_is() {
     let bed = Bed::new();
     let ply = |count: &str| {
-        format!("ply\nformat ascii 1.0\nelement vertex {count}\nproperty float x\nproperty float y\nproperty float z\nelement face 1\nproperty list uchar int vertex_indices\nend_header\n")
+        format!(
+            "ply\nformat ascii 1.0\nelement vertex {count}\nproperty float x\nproperty float y\nproperty float z\nelement face 1\nproperty list uchar int vertex_indices\nend_header\n"
+        )
     };
-    bed.write("huge.ply", ply("4000000000000"))
-        .write("beyond.ply", ply("99999999999999999999"))
-        .gz("huge.ply.gz", ply("4000000000000").as_bytes(), 100);
+    bed.write("huge.ply", ply("4000000000000")).write("beyond.ply", ply("99999999999999999999")).gz(
+        "huge.ply.gz",
+        ply("4000000000000").as_bytes(),
+        100,
+    );
     let mut stl = vec![0; 84 + 50];
     stl[80..84].fill(0xff);
     bed.write("huge.stl", stl);
@@ -150,7 +154,10 @@ fn headers_that_claim_more_than_there_is() {
         .write("deep.nrrd", nrrd("4000 4000 4000000000", "raw"))
         .write("packed.nrrd", nrrd("4000 4000 4000", "gzip"))
         .write("long.nrrd", format!("NRRD0004\n{}", "# padding\n".repeat(200_000)))
-        .write("list.nhdr", "NRRD0004\ntype: uchar\ndimension: 3\nsizes: 2 2 2\nencoding: raw\ndata file: a%d 0 9000000000 1\n");
+        .write(
+            "list.nhdr",
+            "NRRD0004\ntype: uchar\ndimension: 3\nsizes: 2 2 2\nencoding: raw\ndata file: a%d 0 9000000000 1\n",
+        );
     let mut nii = vec![0u8; 352];
     nii[..4].copy_from_slice(&348i32.to_le_bytes());
     for (k, d) in [3i16, 32767, 32767, 32767].into_iter().enumerate() {
@@ -180,7 +187,8 @@ fn bombs() {
     // 2^18 x 4 bytes from 18 lines, and then in some thousand attributes
     let doubling: String = (1..=18).map(|i| format!("<default name='a{i}x' value='$a{0}x$a{0}x'/>\n", i - 1)).collect();
     let start = "<default name='a0x' value='lol '/>\n";
-    let many = |n: usize, value: &str| (0..n).map(|i| format!("<string name='s{i}' value='{value}'/>\n")).collect::<String>();
+    let many =
+        |n: usize, value: &str| (0..n).map(|i| format!("<string name='s{i}' value='{value}'/>\n")).collect::<String>();
     bed.xml("doubling.xml", &format!("{start}{doubling}<default name='b' value='$a18x$a18x$a18x$a18x'/>"))
         .xml("sum.xml", &format!("{start}{doubling}{}", many(4000, "$a17x")))
         .xml("defaults.xml", &{
@@ -191,10 +199,19 @@ fn bombs() {
             "entities.xml",
             "<!DOCTYPE s [<!ENTITY a 'aaaaaaaaaa'><!ENTITY b '&a;&a;&a;&a;&a;&a;&a;&a;'>]>\n<scene version='&b;'/>",
         )
-        .write("deep.xml", "<scene version='3.0.0'>".to_owned() + &"<a>".repeat(1_000_000) + &"</a>".repeat(1_000_000) + "</scene>")
+        .write(
+            "deep.xml",
+            "<scene version='3.0.0'>".to_owned() + &"<a>".repeat(1_000_000) + &"</a>".repeat(1_000_000) + "</scene>",
+        )
         .write("deep-shapes.xml", "<scene version='3.0.0'>\n".to_owned() + &"<shape type='cube'>\n".repeat(1_000_000))
         .xml("nested.xml", &("<bsdf type='twosided'>\n".repeat(1000) + &"</bsdf>".repeat(1000)))
-        .write("wide.xml", format!("<scene version='3.0.0'>\n<shape {}/>", (0..20_000).map(|i| format!("a{i}='' ")).collect::<String>()))
+        .write(
+            "wide.xml",
+            format!(
+                "<scene version='3.0.0'>\n<shape {}/>",
+                (0..20_000).map(|i| format!("a{i}='' ")).collect::<String>()
+            ),
+        )
         .gz("line.obj.gz", TRIANGLE.as_bytes(), 256 << 20)
         .gz("word.stl.gz", b"solid ", 256 << 20)
         .gz("word.ply.gz", b"ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nend_header\n", 256 << 20)
@@ -230,7 +247,12 @@ fn cycles_and_references_to_nothing() {
     bed.xml("self.xml", "<include filename='self.xml'/>")
         .xml("one.xml", "\n<include filename='two.xml'/>")
         .xml("two.xml", "<include filename='one.xml'/>")
-        .xml("ref.xml", &format!("<bsdf type='twosided' id='m'><ref id='m'/></bsdf>\n<shape type='cube'><ref id='m'/></shape>{LIT}"))
+        .xml(
+            "ref.xml",
+            &format!(
+                "<bsdf type='twosided' id='m'><ref id='m'/></bsdf>\n<shape type='cube'><ref id='m'/></shape>{LIT}"
+            ),
+        )
         .xml(
             "pair.xml",
             &format!(
@@ -245,7 +267,9 @@ fn cycles_and_references_to_nothing() {
         .write("back.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf -1 -2 -4\n")
         .write("huge.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 99999999999999999999\n");
     let ply = |index: &str| {
-        format!("ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\nelement face 1\nproperty list uchar int vertex_indices\nend_header\n0 0 0\n1 0 0\n0 1 0\n3 0 1 {index}\n")
+        format!(
+            "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\nelement face 1\nproperty list uchar int vertex_indices\nend_header\n0 0 0\n1 0 0\n0 1 0\n3 0 1 {index}\n"
+        )
     };
     bed.write("beyond.ply", ply("3")).write("minus.ply", ply("-1"));
     bed.mistakes(&[
@@ -275,8 +299,14 @@ fn nothing_to_see_or_to_see_by() {
         .xml("dark.xml", "<shape type='cube'/>")
         .xml("empty.xml", LIT)
         .xml("black.xml", "<shape type='cube'/><emitter type='constant'><rgb name='radiance' value='0'/></emitter>")
-        .xml("flat.xml", &format!("<shape type='cube'>\n<transform name='to_world'><scale value='0'/></transform></shape>{LIT}"))
-        .xml("nan.xml", &format!("<shape type='cube'>\n<transform name='to_world'><scale value='nan'/></transform></shape>{LIT}"))
+        .xml(
+            "flat.xml",
+            &format!("<shape type='cube'>\n<transform name='to_world'><scale value='0'/></transform></shape>{LIT}"),
+        )
+        .xml(
+            "nan.xml",
+            &format!("<shape type='cube'>\n<transform name='to_world'><scale value='nan'/></transform></shape>{LIT}"),
+        )
         .xml("point.xml", &format!("<shape type='sphere'>\n<float name='radius' value='0'/></shape>{LIT}"))
         .write("even.nrrd", "NRRD0004\ntype: uchar\ndimension: 3\nsizes: 2 2 2\nencoding: raw\n\n\0\0\0\0\0\0\0\0");
     bed.mistakes(&[
@@ -305,7 +335,10 @@ fn nothing_to_see_or_to_see_by() {
     let counts = &report["prepare"]["counts"];
     let found = ["records", "triangles", "degenerate", "non_finite"].map(|key| counts[key].as_u64());
     assert_eq!(found, [3, 1, 1, 1].map(Some), "{counts}");
-    assert_eq!((report["skipped"]["degenerate"].as_u64(), report["skipped"]["non_finite"].as_u64()), (Some(1), Some(1)));
+    assert_eq!(
+        (report["skipped"]["degenerate"].as_u64(), report["skipped"]["non_finite"].as_u64()),
+        (Some(1), Some(1))
+    );
 }
 
 /// Files that a scene must not read, and things that are no files.
@@ -318,7 +351,8 @@ fn what_lies_outside_or_is_no_file() {
     symlink("../secret.obj", bed.path().join("in/link.obj")).unwrap();
     symlink("/dev/zero", bed.path().join("in/zero.xml")).unwrap();
     fs::create_dir(bed.path().join("in/folder.obj")).unwrap();
-    let nhdr = |file: &str| format!("NRRD0004\ntype: uchar\ndimension: 3\nsizes: 2 2 2\nencoding: raw\ndata file: {file}\n\n");
+    let nhdr =
+        |file: &str| format!("NRRD0004\ntype: uchar\ndimension: 3\nsizes: 2 2 2\nencoding: raw\ndata file: {file}\n\n");
     bed.xml("in/up.xml", &mesh("../secret.obj"))
         .xml("in/absolute.xml", &mesh(absolute.to_str().unwrap()))
         .xml("in/link.xml", &mesh("link.obj"))
@@ -404,8 +438,11 @@ fn dicom_folders() {
     let bed = Bed::new();
     for z in 0..3 {
         bed.write(&format!("good/{z}.dcm"), dicom("1.2.3", z)).write(&format!("mixed/a{z}.dcm"), dicom("1.2.3", z));
-        bed.write(&format!("mixed/b{z}.dcm"), dicom("1.2.4", z)).write(&format!("gap/{z}.dcm"), dicom("1.2.3", z * z + z));
+        bed.write(&format!("mixed/b{z}.dcm"), dicom("1.2.4", z));
         bed.write(&format!("cut/{z}.dcm"), dicom("1.2.3", z));
+    }
+    for z in [0, 1, 2, 4, 5] {
+        bed.write(&format!("gap/{z}.dcm"), dicom("1.2.3", z));
     }
     let whole = dicom("1.2.3", 1);
     bed.write("cut/1.dcm", &whole[..whole.len() - 3]).write("none/readme.txt", "nothing here");
@@ -413,7 +450,7 @@ fn dicom_folders() {
     assert_eq!(bed.line("render mixed/b1.dcm --iso 1 --spp 1 --size 4x4").code, 0);
     bed.mistakes(&[
         ("render mixed --iso 1", &["mixed", "2 DICOM series", "give one file of the series", "a0.dcm", "b0.dcm"]),
-        ("render gap --iso 1", &["gap/2.dcm", "an image is missing, or the spacing is uneven"]),
+        ("render gap --iso 1", &["gap/4.dcm", "gap/2.dcm", "an image is missing, or the spacing is uneven"]),
         ("render cut --iso 1", &["cut/1.dcm"]),
         ("render none --iso 1", &["none", "no DICOM image"]),
         ("render good", &["good", "--iso"]),
@@ -439,7 +476,7 @@ fn outputs_and_memory() {
     ]);
     // what it takes is said, is enough, and a byte less is not
     let told = bed.line(&format!("{render} --memory 100")).err;
-    let needed = told.split("largest split takes ").nth(1).and_then(|t| t.split(' ').next()).unwrap();
+    let needed = told.split("largest split takes ").nth(1).and_then(|t| t.split(';').next()).unwrap();
     let needed: u64 = needed.parse().unwrap_or_else(|_| panic!("{needed:?} in {told}"));
     assert_eq!(bed.line(&format!("{render} --memory {needed}")).code, 0);
     assert_eq!(bed.line(&format!("{render} --memory {}", needed - 1)).code, 2);
@@ -471,7 +508,10 @@ fn outputs_and_memory() {
 fn job_files() {
     let bed = Bed::new();
     let cornell = repository("examples/cornell-box.xml");
-    let job = format!("apiVersion: rayherd.io/v1alpha1\nkind: RenderJob\nspec:\n  scene: {{source: {}}}\n", cornell.display());
+    let job = format!(
+        "apiVersion: rayherd.io/v1alpha1\nkind: RenderJob\nspec:\n  scene: {{source: {}}}\n",
+        cornell.display()
+    );
     bed.write("good.yaml", format!("{job}  image: {{size: 8x8, output: good.exr}}\n  sampling: {{spp: 1}}\n"));
     assert_eq!(bed.line("render -f good.yaml").code, 0);
     bed.write("noise.yaml", noise(3000))

@@ -82,16 +82,24 @@ impl Resident {
         self.blocks[self.block_of(slot)].1
     }
     /// To be shaded: reads the attributes when they are asked for first.
-    fn surfaces(
+    ///
+    /// # Errors
+    /// When they cannot be read, or do not go with the geometry.
+    pub fn surfaces(&self, scene: &PreparedScene, blocks: &dyn Blocks) -> Result<ResidentSurfaces<'_>, JobError> {
+        self.surfaces_in(None, scene, blocks)
+    }
+
+    /// The same, in a memory where others may be loading.
+    fn surfaces_in(
         &self,
+        memory: Option<&Memory>,
         scene: &PreparedScene,
         blocks: &dyn Blocks,
-        memory: &Memory,
     ) -> Result<ResidentSurfaces<'_>, JobError> {
         if self.attributes.get().is_none() {
             let _one = lock(&self.reading);
             if self.attributes.get().is_none() {
-                let _alone = memory.loading();
+                let _alone = memory.and_then(Memory::loading);
                 let read = self.blocks.iter().map(|&(_, split)| {
                     let entry = &scene.manifest.splits[split as usize];
                     let bytes = blocks.attributes(split)?;
@@ -255,12 +263,12 @@ pub struct Lease<'a> {
 }
 
 impl Lease<'_> {
-    /// To be shaded: reads the attributes when they are asked for first.
+    /// As [`Resident::surfaces`], while no other task of the node loads anything if its memory has a limit.
     ///
     /// # Errors
-    /// When they cannot be read, or do not go with the geometry.
+    /// As there.
     pub fn surfaces(&self, scene: &PreparedScene, blocks: &dyn Blocks) -> Result<ResidentSurfaces<'_>, JobError> {
-        self.resident.surfaces(scene, blocks, self.memory)
+        self.resident.surfaces_in(Some(self.memory), scene, blocks)
     }
 }
 

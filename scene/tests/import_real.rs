@@ -185,7 +185,10 @@ fn chest() {
                 let folder = folder.join("dicom");
                 scope.spawn(move || {
                     let found = Surface::of(&IsoSurfaceSource::new(&folder, iso).unwrap());
-                    println!("{iso}: {} triangles, {} flat, {} edges on the border", found.triangles, found.flat, found.border);
+                    println!(
+                        "{iso}: {} triangles, {} flat, {} edges on the border",
+                        found.triangles, found.flat, found.border
+                    );
                     assert!(within(found.triangles, triangles), "{iso}: {} triangles", found.triangles);
                     assert!(found.flat.abs_diff(flat) <= triangles / 1000, "{iso}: {} flat triangles", found.flat);
                     assert_eq!(found.unmatched, 0, "{iso}: an inner edge without its twin");

@@ -26,7 +26,9 @@ fn vertices() -> impl Iterator<Item = [f64; 3]> {
 }
 
 fn triangles() -> impl Iterator<Item = [usize; 3]> {
-    (0..N - 1).flat_map(|i| (0..N - 1).map(move |j| i * N + j)).flat_map(|a| [[a, a + N, a + 1], [a + 1, a + N, a + N + 1]])
+    (0..N - 1)
+        .flat_map(|i| (0..N - 1).map(move |j| i * N + j))
+        .flat_map(|a| [[a, a + N, a + 1], [a + 1, a + N, a + N + 1]])
 }
 
 fn ply(binary: bool) -> Vec<u8> {
@@ -247,7 +249,8 @@ fn each_file_is_read_at_most_twice_and_counted() {
     });
     let part = format!("<scene version='3.0.0'>{shapes}</scene>");
     for (sensor, what) in [("", "framed by reading"), ("<sensor type='perspective'/>", "not framed")] {
-        let scene = format!("<scene version='3.0.0'><include filename='part.xml'/><emitter type='constant'/>{sensor}</scene>");
+        let scene =
+            format!("<scene version='3.0.0'><include filename='part.xml'/><emitter type='constant'/>{sensor}</scene>");
         let mut files = files.clone();
         files.extend([("scene.xml", scene.as_bytes()), ("part.xml", part.as_bytes())]);
         println!("{what}");
@@ -257,7 +260,8 @@ fn each_file_is_read_at_most_twice_and_counted() {
     let side = 48;
     let volume = samples(side);
     let head = |more: &str| {
-        format!("NRRD0004\ntype: short\ndimension: 3\nsizes: {side} {side} {side}\nendian: little\n{more}\n").into_bytes()
+        format!("NRRD0004\ntype: short\ndimension: 3\nsizes: {side} {side} {side}\nendian: little\n{more}\n")
+            .into_bytes()
     };
     let raw = [head("encoding: raw\n"), volume.clone()].concat();
     let packed = [head("encoding: gzip\n"), gz(&volume)].concat();

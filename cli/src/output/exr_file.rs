@@ -39,7 +39,8 @@ pub fn read(path: &Path) -> anyhow::Result<Channels> {
         return Err(mistake("is no regular file: name an EXR picture".into()).into());
     }
     let most = memory_of_machine().unwrap_or(u64::MAX - 1) / SHARE;
-    let bytes = bounded::read(path, most, "this machine has not the memory to compare such pictures, take another one")?;
+    let bytes =
+        bounded::read(path, most, "this machine has not the memory to compare such pictures, take another one")?;
     // the decoder panics on some damaged files (compression B44, in 1.74)
     let image =
         fault::of_others(|| decode(&bytes, most)).unwrap_or_else(|what| Err(format!("cannot be read as EXR: {what}")));
@@ -63,7 +64,9 @@ fn decode(bytes: &[u8], most: u64) -> Result<FlatImage, String> {
         return Err(format!("is damaged: its header claims {claimed} bytes of pixels in a file of {}", bytes.len()));
     }
     if claimed > u128::from(most) {
-        return Err(format!("holds {claimed} bytes of pixels, this machine can take {most}: compare them on a larger one"));
+        return Err(format!(
+            "holds {claimed} bytes of pixels, this machine can take {most}: compare them on a larger one"
+        ));
     }
     exr::prelude::read()
         .no_deep_data()

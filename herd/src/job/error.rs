@@ -19,8 +19,8 @@ pub enum JobError {
     Settings(String),
     /// A node cannot hold what a task needs at once.
     #[error(
-        "{given} bytes of memory per node are too few: the largest split takes {needed}; give more memory, or prepare \
-         smaller splits"
+        "{given} bytes of memory per node are too few: the largest split takes {needed}; give more \
+         --memory, or prepare more --splits or a smaller --block-size"
     )]
     Memory {
         /// What the largest split takes, bytes.

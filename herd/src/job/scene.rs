@@ -88,7 +88,12 @@ impl PreparedScene {
     }
     /// Room that the top trees of all splits take at most, were all of them in one task's memory.
     pub(crate) fn top_bytes(&self) -> u64 {
-        self.grid.owning().iter().map(|s| &self.manifest.splits[s as usize]).map(|e| top_bytes(e.triangles + e.spheres)).sum()
+        self.grid
+            .owning()
+            .iter()
+            .map(|s| &self.manifest.splits[s as usize])
+            .map(|e| top_bytes(e.triangles + e.spheres))
+            .sum()
     }
     /// The splits that rays can need, neighbours in space beside each other: those that own a cell. After overlap
     /// reduction a source split may own none, as all its primitives are in copies.

@@ -24,6 +24,7 @@ pub use run::render_local;
 
 use crate::job::{Image, JobError, JobSettings, PreparedScene, Sampling};
 use crate::report::Report;
+use crate::resident::FOREST_BYTES;
 
 pub use journal::{Collected, collect};
 

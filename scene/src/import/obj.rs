@@ -170,9 +170,9 @@ impl ObjReader {
         let index = if value < 0 { seen.checked_add(value) } else { value.checked_sub(1) };
         match index {
             Some(i) if (0..seen).contains(&i) && i < i64::from(NONE) => Ok(i as u32),
-            Some(i) if (0..seen).contains(&i) => {
-                self.source.fail_limit(format!("more than {NONE} of one kind of vertex: cut the mesh into several files"))
-            }
+            Some(i) if (0..seen).contains(&i) => self
+                .source
+                .fail_limit(format!("more than {NONE} of one kind of vertex: cut the mesh into several files")),
             _ => {
                 let name = ["v", "vt", "vn"][kind];
                 self.source.fail_line(format!("index {value} of {name}, but {seen} of them stand above"))

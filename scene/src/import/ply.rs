@@ -71,18 +71,7 @@ impl PlyReader {
                     }
                     let left = element.count;
                     let (format, faces, fan) = (header.format, element, Fan::default());
-                    return Ok(PlyReader {
-                        source,
-                        format,
-                        budget,
-                        positions,
-                        normals,
-                        uv,
-                        faces,
-                        list,
-                        left,
-                        fan,
-                    });
+                    return Ok(PlyReader { source, format, budget, positions, normals, uv, faces, list, left, fan });
                 }
                 _ => {
                     for _ in 0..if element.properties.is_empty() { 0 } else { element.count } {
@@ -174,11 +163,7 @@ impl TriangleReader for PlyReader {
         let corner = |i| self.positions.get(i).unwrap_or([f64::NAN; 3]);
         let gather3 = |c: &Column<[f32; 3]>| vertices.map(|i| c.get(i).unwrap_or_default());
         let gather2 = |c: &Column<[f32; 2]>| vertices.map(|i| c.get(i).unwrap_or_default());
-        Corners {
-            p: vertices.map(corner),
-            n: self.normals.as_ref().map(gather3),
-            uv: self.uv.as_ref().map(gather2),
-        }
+        Corners { p: vertices.map(corner), n: self.normals.as_ref().map(gather3), uv: self.uv.as_ref().map(gather2) }
     }
 
     fn has_normals(&self, _: &[u32; 3]) -> bool {

@@ -68,16 +68,7 @@ impl Source {
                 (Input::Plain(file), first.len())
             }
         };
-        Ok(Source {
-            path: path.into(),
-            input,
-            buffer,
-            start: 0,
-            end,
-            offset: 0,
-            line: 0,
-            file_length: metadata.len(),
-        })
+        Ok(Source { path: path.into(), input, buffer, start: 0, end, offset: 0, line: 0, file_length: metadata.len() })
     }
 
     /// Bytes read from disk, packed ones for gzip.

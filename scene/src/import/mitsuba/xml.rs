@@ -204,7 +204,9 @@ impl Parameters {
             if out.len() + value.len() > MAX_VALUE {
                 return malformed(
                     place,
-                    format!("${name} makes a value of more than {MAX_VALUE} bytes: does its <default> repeat other defaults?"),
+                    format!(
+                        "${name} makes a value of more than {MAX_VALUE} bytes: does its <default> repeat other defaults?"
+                    ),
                 );
             }
             self.expanded += value.len();

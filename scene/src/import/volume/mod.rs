@@ -17,9 +17,9 @@ use std::path::Path;
 use crate::ImportError;
 use crate::description::Affine;
 use layout::Layout;
-use slices::{Bytes, Counted};
 pub use layout::SampleType;
 pub use slices::Slices;
+use slices::{Bytes, Counted};
 
 /// Most samples in one slice: 4096 x 4096. Two slices of f64 are in memory while a surface is made, 256 MiB of these.
 pub const MAX_SLICE_SAMPLES: u64 = 1 << 24;
