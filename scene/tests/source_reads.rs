@@ -210,7 +210,10 @@ fn check(folder: &Path, source: &str, iso: Option<f64>, reads: u32, primitives: 
     }
 }
 
-fn folder(files: &[(&str, &[u8])]) -> tempfile::TempDir {
+/// A file's name and content.
+type Named<'a> = (&'a str, &'a [u8]);
+
+fn folder(files: &[Named]) -> tempfile::TempDir {
     let folder = tempfile::tempdir().unwrap();
     for (name, bytes) in files {
         fs::write(folder.path().join(name), bytes).unwrap();
@@ -244,7 +247,7 @@ fn each_file_is_read_at_most_twice_and_counted() {
     let shapes: String = meshes.iter().enumerate().fold(String::new(), |mut text, (i, (name, _))| {
         let kind = name.trim_end_matches(".gz").rsplit('.').next().unwrap();
         write!(text, "<shape type='{kind}'><string name='filename' value='{name}'/>").unwrap();
-        write!(text, "<transform name='to_world'><translate x='{}'/></transform></shape>\n", 100 * i).unwrap();
+        writeln!(text, "<transform name='to_world'><translate x='{}'/></transform></shape>", 100 * i).unwrap();
         text
     });
     let part = format!("<scene version='3.0.0'>{shapes}</scene>");
@@ -267,7 +270,7 @@ fn each_file_is_read_at_most_twice_and_counted() {
     let packed = [head("encoding: gzip\n"), gz(&volume)].concat();
     let apart = head("encoding: raw\ndata file: v.raw\n");
     let nii = nifti(side, &volume);
-    let volumes: [(&str, &[(&str, &[u8])]); 5] = [
+    let volumes: [(&str, &[Named]); 5] = [
         ("a.nrrd", &[("a.nrrd", &raw)]),
         ("b.nrrd", &[("b.nrrd", &packed)]),
         ("c.nhdr", &[("c.nhdr", &apart), ("v.raw", &volume)]),

@@ -68,7 +68,7 @@ impl Budget {
 
     /// Writes so many zeros to the file and maps them, to be changed.
     fn spill_zeros(&mut self, bytes: u64) -> io::Result<MmapMut> {
-        const ZEROS: [u8; 1 << 16] = [0; 1 << 16];
+        static ZEROS: [u8; 1 << 16] = [0; 1 << 16];
         // whole pages, so that what comes after begins at a page again
         let (at, whole) = (self.length, bytes.next_multiple_of(ZEROS.len() as u64));
         let file = self.file(whole)?;
