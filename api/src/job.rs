@@ -248,7 +248,8 @@ pub struct WorkersSpec {
     /// Tasks at a time per node: one number for all nodes, or one for each. By default the threads of the machine.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub slots: Vec<i32>,
-    /// Memory of one node for blocks, rays and film. By default what the machine has.
+    /// Scene data (geometry and attributes) that one node may hold in memory; rays and film come on top, bounded apart from it. By
+    /// default there is no limit.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub memory: Option<ByteSize>,
 }

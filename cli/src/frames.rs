@@ -76,7 +76,7 @@ fn check_memory([width, height]: [u32; 2]) -> Result<(), Mistake> {
     let Some(have) = memory_of_machine() else { return Ok(()) };
     if needed > have {
         let gib = |bytes: u64| bytes as f64 / f64::from(1 << 30);
-        let message = "give a smaller --size, or render it in parts with several cameras";
+        let message = "give a smaller --size, or several --camera with a smaller FOV, each with a picture of its own";
         return Err(Mistake(format!(
             "an image of {width}x{height} pixels takes {:.1} GiB, this machine has {:.1}: {message}",
             gib(needed),

@@ -20,6 +20,27 @@ fn a_good_scene_is_described_and_left_alone() {
     assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 0);
 }
 
+/// What a bare mesh loses is told, once.
+#[test]
+fn materials_of_a_mesh_are_missed_aloud() {
+    let folder = tempfile::tempdir().unwrap();
+    let text = "# two\nmtllib a.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nusemtl red\nmtllib b.mtl\nf 1 2 3\n";
+    fs::write(folder.path().join("a.obj"), text).unwrap();
+    let told = |run: &common::Run| {
+        assert_eq!(run.code, 0, "{}", run.err);
+        run.err.matches("a.obj:2: the file's materials (mtllib) are not read").count()
+    };
+    assert_eq!(told(&rayherd(folder.path(), &["check", "a.obj"])), 1);
+    assert_eq!(told(&rayherd(folder.path(), &["prepare", "a.obj", "--store", "s"])), 1);
+    // a scene around it has materials of its own
+    let scene = "<scene version='3.0.0'><shape type='obj'><string name='filename' value='a.obj'/></shape>\
+        <emitter type='constant'/><sensor type='perspective' id='one'/>\n<sensor type='perspective' id='two'/></scene>";
+    fs::write(folder.path().join("s.xml"), scene).unwrap();
+    let run = rayherd(folder.path(), &["check", "s.xml"]);
+    assert_eq!(told(&run), 0);
+    assert!(run.err.contains("s.xml:2: sensor \"two\" is left out"), "{}", run.err);
+}
+
 /// Everything wrong is told at once: what is not supported, and each file that is broken.
 #[test]
 fn all_problems_are_named() {

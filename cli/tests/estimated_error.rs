@@ -71,6 +71,24 @@ fn all_scenes(effort: &Effort) {
     };
     write("lamp.xml", &[floor, lamp]);
     write("sky.xml", &[floor, ball, sky]);
+    // a ring of a mesh, with smooth normals, under the same sky
+    let (around, across) = (48, 24);
+    let mut ring = String::new();
+    for i in 0..around * across {
+        let [a, b] = [(i / across, around), (i % across, across)]
+            .map(|(k, n)| f64::from(k) / f64::from(n) * std::f64::consts::TAU);
+        let r = 1.2 + 0.5 * b.cos();
+        ring += &format!("v {} {} {}\n", r * a.cos(), 0.8 + 0.5 * b.sin(), r * a.sin());
+    }
+    for i in 0..around * across {
+        let at = |i: u32, j: u32| (i % around) * across + j % across + 1;
+        let (a, b) = (i / across, i % across);
+        ring += &format!("f {} {} {} {}\n", at(a, b), at(a, b + 1), at(a + 1, b + 1), at(a + 1, b));
+    }
+    fs::write(folder.join("ring.obj"), ring).unwrap();
+    let mesh = "<shape type='obj'><string name='filename' value='ring.obj'/>\
+        <bsdf type='diffuse'><rgb name='reflectance' value='0.7,0.8,0.6'/></bsdf></shape>";
+    write("mesh.xml", &[floor, mesh, sky]);
     // a gyroid's cells, as a scan
     let side = 24u32;
     let mut scan =
@@ -84,7 +102,8 @@ fn all_scenes(effort: &Effort) {
     fs::write(folder.join("scan.nrrd"), scan).unwrap();
 
     let cornell = example("examples/cornell-box.xml");
-    let scenes: [&[&str]; 4] = [&[&cornell], &["lamp.xml"], &["sky.xml"], &["scan.nrrd", "--iso", "100.5"]];
+    let scenes: [&[&str]; 5] =
+        [&[&cornell], &["lamp.xml"], &["sky.xml"], &["mesh.xml"], &["scan.nrrd", "--iso", "100.5"]];
     for scene in scenes {
         let ratio = ratio(folder, scene, effort);
         assert!((0.8..=1.25).contains(&ratio), "{scene:?}: {ratio}");

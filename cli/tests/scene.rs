@@ -33,5 +33,8 @@ fn scenes_grow_and_lose_their_order() {
     refused(&["subdivide", "t.obj", "-o", "none/x.ply"], &["none/x.ply"]);
     refused(&["replicate", "t.obj", "-o", "x.ply", "--copies", "2,2", "--step", "1,1,1"], &["--copies", "three"]);
     refused(&["interleave", "t.obj", "-o", "x.ply", "--strands", "0"], &["1 to 4096"]);
+    // found before anything is written: this would be 1.2 TB
+    let many = ["replicate", "t.obj", "-o", "x.ply", "--copies", "1000000,1000,1", "--step", "1,1,1"];
+    refused(&many, &["12000000000 vertices", "fewer levels or copies"]);
     assert!(!folder.path().join("x.ply").exists());
 }

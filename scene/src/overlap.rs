@@ -1,7 +1,7 @@
 //! Overlap reduction: which contested cells are copied together.
 //!
 //! Every contested cell is copied as a whole, and so are the cells that a split would be left with when they hold less than
-//! an eighth of it: a whole split is not kept, placed and loaded for them (the paper keeps it). It is done so so that afterwards each cell has one owner that holds all of its primitives. The
+//! an eighth of it: a whole split is not kept, placed and loaded for them (the paper keeps it). It is done so that afterwards each cell has one owner that holds all of its primitives. The
 //! splits they came from are not rewritten: only the contested share of the scene moves.
 //!
 //! In two steps, as the number of *distinct* primitives in several cells is known only from the primitives. First, cells

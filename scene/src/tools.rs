@@ -63,6 +63,7 @@ pub fn subdivide(source: &dyn RecordSource, levels: u32, out: &Path) -> Result<W
         )));
     }
     let grid = Grid::new(levels);
+    check_vertices(source, grid.len() as u64)?;
     let mut file = PlyWriter::new(out)?;
     let mut points = vec![];
     let read = each(source, &mut |t| {
@@ -89,6 +90,7 @@ pub fn replicate(
     if step.iter().any(|x| !x.is_finite()) {
         return Err(ToolError::Refused(format!("copies {step:?} apart: the distances should be finite")));
     }
+    check_vertices(source, copies.iter().fold(3u64, |n, &c| n.saturating_mul(c.into())))?;
     let mut file = PlyWriter::new(out)?;
     let mut read = 0;
     for z in 0..copies[2] {
@@ -119,6 +121,7 @@ pub fn interleave(source: &dyn RecordSource, strands: u32, out: &Path) -> Result
     let mut raw = BufWriter::with_capacity(1 << 20, temporary_file(folder_of(out)).map_err(io)?);
     let read = each(source, &mut |t| raw.write_all(bytemuck::bytes_of(&t)).map_err(io))?;
     let mut raw = raw.into_inner().map_err(|e| io(e.into_error()))?;
+    refuse_vertices(read, 3)?;
 
     let length = read.div_ceil(strands.into()).max(1);
     let strand = |first: u64| Strand { next: first, end: (first + length).min(read), waiting: vec![].into_iter() };
@@ -215,6 +218,29 @@ impl Grid {
     }
 }
 
+/// Refuses what would have too many vertices before any is written: for it the source is read once more.
+fn check_vertices(source: &dyn RecordSource, each_makes: u64) -> Result<(), ToolError> {
+    let mut stream = source.open_places()?;
+    let (mut records, mut n) = (Vec::with_capacity(4096), 0);
+    while stream.next(&mut records, 4096)? > 0 {
+        n += records.len() as u64;
+        refuse_vertices(n, each_makes)?;
+        records.clear();
+    }
+    Ok(())
+}
+
+fn refuse_vertices(triangles: u64, each_makes: u64) -> Result<(), ToolError> {
+    let vertices = triangles.saturating_mul(each_makes);
+    if vertices > u64::from(u32::MAX) {
+        return Err(ToolError::Refused(format!(
+            "{triangles} triangles or more would have {vertices} vertices; PLY numbers 4294967295 at most: take fewer levels or \
+             copies, or make several files (a folder of meshes is a scene)"
+        )));
+    }
+    Ok(())
+}
+
 /// Passes every triangle of a source to `f`; how many there are.
 fn each(source: &dyn RecordSource, f: &mut dyn FnMut(Triangle) -> Result<(), ToolError>) -> Result<u64, ToolError> {
     let mut stream = source.open()?;
@@ -265,11 +291,8 @@ impl PlyWriter {
 
     fn vertex(&mut self, p: [f64; 3]) -> Result<(), ToolError> {
         self.vertices += 1;
-        if self.vertices > u64::from(u32::MAX) {
-            return Err(ToolError::Refused(
-                "more than 4294967295 vertices: PLY cannot number them, make several files".into(),
-            ));
-        }
+        // a source that grew since it was counted
+        refuse_vertices(self.vertices, 1)?;
         let bytes = p.map(f64::to_le_bytes);
         self.file.write_all(bytes.as_flattened()).map_err(|e| self.error(e))
     }

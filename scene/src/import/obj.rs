@@ -30,6 +30,8 @@ pub(super) struct ObjReader {
     line: Vec<u8>,
     /// Whether anything was read that an OBJ file has.
     recognized: bool,
+    /// Whether a library of materials is to be told of, once.
+    tell_materials: bool,
 }
 
 impl ObjReader {
@@ -45,7 +47,24 @@ impl ObjReader {
             fanned: 0,
             line: vec![],
             recognized: false,
+            tell_materials: false,
         })
+    }
+
+    /// The same, which warns when the file names materials: nobody else gives the mesh its own.
+    pub fn telling_materials(self) -> Self {
+        ObjReader { tell_materials: true, ..self }
+    }
+
+    fn tell_materials(&mut self) {
+        if std::mem::take(&mut self.tell_materials) {
+            let (file, line) = self.source.place();
+            tracing::warn!(
+                "{}:{line}: the file's materials (mtllib) are not read, the mesh is of one: choose it by --albedo, or write a \
+                 Mitsuba scene around the mesh",
+                file.display()
+            );
+        }
     }
 
     /// Reads a line with its continuations into `self.line`; false at the end.
@@ -77,6 +96,7 @@ impl ObjReader {
                 b"vt" => self.texture_coordinate(words)?,
                 b"vn" => self.normal(words)?,
                 b"f" => self.face(words)?,
+                b"mtllib" => self.tell_materials(),
                 _ => {}
             }
             self.line = line;

@@ -109,12 +109,18 @@ impl Source {
 
     /// The zlib data that begin at a byte of a file that is not packed otherwise.
     pub fn into_zlib(self, at: u64) -> Result<Source, ImportError> {
-        let Input::Plain(mut file) = self.input else {
+        if !matches!(self.input, Input::Plain(_)) {
             return self.fail_byte("packed twice: unpack it once");
-        };
+        }
+        let Input::Plain(mut file) = self.input else { unreachable!("looked at above") };
         file.0.seek(SeekFrom::Start(at)).map_err(|source| ImportError::Io { path: self.path.clone(), source })?;
         let input = Input::Zlib(Box::new(ZlibDecoder::new(file)));
         Ok(Source { input, start: 0, end: 0, offset: 0, ..self })
+    }
+
+    /// The file and the last line read.
+    pub fn place(&self) -> (&Path, u32) {
+        (&self.path, self.line)
     }
 
     /// An error at the last line read.

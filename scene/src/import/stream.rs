@@ -96,11 +96,16 @@ impl<'a> DescriptionSource<'a> {
             }
             Geometry::Sphere { center, radius } => Box::new(Once(Some(sphere(shape, number, *center, *radius)))),
             Geometry::MeshFile { path, format, flip_v, smooth } => {
-                let smooth = *smooth && normals;
+                let (smooths, smooth) = (*smooth, *smooth && normals);
                 let options = MeshOptions { placement, flip_v: *flip_v, smooth, spilled: &self.spilled };
                 match format {
                     MeshFormat::Ply => Box::new(MeshStream::new(PlyReader::open(path, &self.options)?, options)?),
-                    MeshFormat::Obj => Box::new(MeshStream::new(ObjReader::open(path, &self.options)?, options)?),
+                    MeshFormat::Obj => {
+                        let reader = ObjReader::open(path, &self.options)?;
+                        // a scene around the mesh gives it a material (and smooths it); told in one of two passes
+                        let reader = if normals && !smooths { reader.telling_materials() } else { reader };
+                        Box::new(MeshStream::new(reader, options)?)
+                    }
                     MeshFormat::Serialized(index) => {
                         let reader = SerializedReader::open(path, *index, &self.options)?;
                         let options = MeshOptions { smooth: smooth && !reader.face_normals(), ..options };

@@ -30,9 +30,10 @@ impl Converter<'_> {
         for (_, id) in self.nested(root, "sensor")?.into_iter().take(1) {
             self.sensor(id)?;
         }
-        let sensors = self.nested(root, "sensor")?.len();
-        if sensors > 1 {
-            tracing::warn!(sensors, "the scene has several sensors; the first is used");
+        for (_, id) in self.nested(root, "sensor")?.into_iter().skip(1) {
+            let object = &self.document.objects[id];
+            let name = object.id.as_deref().unwrap_or(&object.plugin);
+            tracing::warn!("{}: sensor \"{name}\" is left out: the first of a scene's sensors is used", object.place);
         }
         for (_, id) in self.nested(root, "integrator")? {
             self.integrator(id)?;
