@@ -59,7 +59,7 @@ fn all_problems_are_named() {
     for part in ["cut.ply", "s.xml:4: bsdf \"ward\" is not supported", "error: 2 problems in s.xml"] {
         assert!(run.err.contains(part), "no {part:?} in {}", run.err);
     }
-    for part in ["5 triangles", "1 of zero area, 1 with NaN", "1 rectangle or cube", "sky of"] {
+    for part in ["5 triangles", "1 of zero area, 1 with NaN", "1 rectangle, cube", "sky of"] {
         assert!(run.out.contains(part), "no {part:?} in {}", run.out);
     }
     // a stand-in that was asked for is no problem
