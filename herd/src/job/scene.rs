@@ -137,3 +137,34 @@ impl PreparedScene {
         out
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::testing::{cornell, prepared};
+
+    #[test]
+    fn owners_that_16_bits_cannot_number_are_refused() {
+        let scene = prepared(&cornell(), 3, false);
+        let open = |owners: u32| {
+            let mut manifest = scene.manifest.clone();
+            manifest.grid.cells[0].owners = (0..owners).collect();
+            PreparedScene::open(manifest, scene.objects.clone()).err()
+        };
+        let error = open(65_536).unwrap();
+        assert!(error.is_users());
+        assert!(
+            error.to_string().contains("65536 owners, 65535 are the most: prepare it with fewer splits"),
+            "{error}"
+        );
+        // so many can be numbered, but three splits do not have them
+        assert!(!open(65_535).unwrap().to_string().contains("are the most"));
+    }
+
+    #[test]
+    fn small_blocks_take_little_of_a_top_tree() {
+        assert_eq!([0, 1, 7, 256, 1 << 20].map(top_bytes), [256, 256, 1792, 65_536, 65_536]);
+        let scene = prepared(&cornell(), 3, true);
+        assert!(scene.top_bytes() > 0 && scene.top_bytes() <= 256 * (scene.manifest.counts.triangles + 1000));
+    }
+}
