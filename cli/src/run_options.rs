@@ -24,7 +24,8 @@ pub struct RunOptions {
     /// Tasks at a time: one number for all nodes, or one for each, such as 2,2,4,4 [default: this machine's threads]
     #[arg(long, value_name = "S", value_delimiter = ',', allow_hyphen_values = true)]
     pub slots: Vec<i32>,
-    /// Scene data that a node may hold in memory, such as 512Mi; rays and film come on top, bounded apart from it
+    /// Scene data that a node may hold in memory, such as 512Mi; rays, film and the one object that is being loaded come
+    /// on top, bounded apart from it
     /// [default: no limit]
     #[arg(long, value_name = "PER_NODE")]
     pub memory: Option<ByteSize>,
