@@ -6,7 +6,7 @@
 use std::path::Path;
 
 use rayherd_scene::ImportError;
-use rayherd_scene::import::{DescriptionSource, ImportOptions, StreamOptions, import};
+use rayherd_scene::import::{DescriptionSource, ImportOptions, StreamOptions, import, sky_map};
 use rayherd_scene::record::RecordSource;
 use rayherd_tests::mutation;
 
@@ -40,6 +40,7 @@ const WORDS: &[&str] = &[
 fn read(path: &Path, substitute: bool) -> Result<usize, ImportError> {
     let options = ImportOptions { substitute, ..ImportOptions::default() };
     let description = import(path, &options)?;
+    sky_map(description.environment.as_ref())?;
     let stream_options = StreamOptions { vertex_budget: 1 << 16, spill_limit: 1 << 20, spill_folder: None };
     let source = DescriptionSource::new(&description, stream_options);
     let mut stream = source.open()?;
@@ -153,5 +154,21 @@ fn mitsuba() {
 <shape type="rectangle"><emitter type="area"><rgb name="radiance" value="3"/></emitter></shape>
 <shape type="ply"><string name="filename" value="a.ply"/></shape></scene>"##;
     let part = r#"<scene><alias id="m" as="n"/><shape type="ply"><string name="filename" value="a.ply"/><ref id="n"/></shape></scene>"#;
-    fuzz("a.xml", &[text.into()], &[("part.xml", part), ("a.ply", PLY)]);
+    // lights, sensors and shapes that are laid out
+    let more = r#"<scene version="3.0.0"><integrator type="path"><boolean name="hide_emitters" value="true"/></integrator>
+<sensor type="thinlens"><float name="fov" value="40"/><float name="apertureRadius" value="0.1"/><float name="focusDistance" value="3"/>
+<film type="hdrfilm"><integer name="width" value="64"/><integer name="height" value="32"/><integer name="cropOffsetX" value="3"/>
+<integer name="cropWidth" value="9"/></film></sensor>
+<emitter type="envmap"><string name="filename" value="sky.hdr"/><float name="scale" value="2"/>
+<transform name="toWorld"><rotate y="1" angle="30"/></transform></emitter>
+<emitter type="point"><point name="position" x="1" y="2" z="3"/><rgb name="intensity" value="1, 2, 3"/></emitter>
+<emitter type="spot"><transform name="to_world"><lookat origin="0,5,0" target="0,0,0" up="1,0,0"/></transform>
+<float name="cutoffAngle" value="30"/><float name="beamWidth" value="10"/></emitter>
+<emitter type="directional"><vector name="direction" x="0" y="-1" z="0.5"/><float name="irradiance" value="2"/></emitter>
+<shape type="shapegroup" id="g"><shape type="sphere"/><shape type="ply"><string name="filename" value="a.ply"/></shape></shape>
+<shape type="instance"><ref id="g"/><transform name="to_world"><translate x="4"/></transform></shape>
+<shape type="instance"><ref id="g"/></shape><shape type="disk"/>
+<shape type="cylinder"><point name="p0" value="0 0 1"/><point name="p1" value="0 2 1"/><float name="radius" value="0.5"/></shape></scene>"#;
+    let sky = "#?RGBE\nFORMAT=32-bit_rle_rgbe\n\n-Y 2 +X 2\nabc\u{7f}def\u{7f}ghi\u{7f}jkl\u{7f}";
+    fuzz("a.xml", &[text.into(), more.into()], &[("part.xml", part), ("a.ply", PLY), ("sky.hdr", sky)]);
 }
