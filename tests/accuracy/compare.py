@@ -39,7 +39,8 @@ def main() -> int:
     mi.set_variant("llvm_ad_rgb")
     failed = 0
     print(f"{'scene':20} {'ch':2} {'rayherd':>10} {'mitsuba':>10} {'difference':>10} {'3 s.e.':>8}  tiles > 4 s.e.  verdict")
-    names = [n for name in a.names for n in (scenes.MATERIALS if name == "materials" else [name])]
+    groups = {"materials": scenes.MATERIALS, "emitters": scenes.EMITTERS}
+    names = [n for name in a.names for n in groups.get(name, [name])]
     for name in names:
         xml = scenes.prepare(name, a.shared.resolve(), a.work.resolve())
         scene = mi.load_file(str(xml), **scenes.parameters(xml, a.size, a.max_depth))

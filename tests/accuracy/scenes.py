@@ -49,6 +49,65 @@ SMALL = """<scene version="3.0.0">
 </scene>
 """
 
+# one small scene per emitter, sensor and shape that is not a mesh: a ball, a copper block and a pillar on a floor
+ENVMAP = ('<emitter type="envmap"><string name="filename" value="sky.hdr"/><float name="scale" value="0.7"/><transform name="to_world">'
+          '<rotate x="1" angle="25"/><rotate y="1" angle="70"/></transform></emitter>')
+DISK = ('<shape type="disk"><transform name="to_world"><scale value="0.5"/><rotate x="1" angle="90"/><translate x="0.3" y="2.4"/></transform>'
+        '<emitter type="area"><rgb name="radiance" value="12, 10, 8"/></emitter></shape>')
+FOV = '<float name="fov" value="40"/>'
+# emitters; the sensor's type and what it has
+EMITTERS = {
+    "envmap": (ENVMAP, "perspective", FOV),
+    "point": ('<emitter type="point"><point name="position" x="1" y="2" z="1"/><rgb name="intensity" value="8, 6, 5"/></emitter>',
+              "perspective", FOV),
+    "spot": ('<emitter type="spot"><transform name="to_world"><lookat origin="1, 3, 1" target="-0.3, 0.3, 0" up="0, 1, 0"/></transform>'
+             '<float name="cutoff_angle" value="25"/><float name="beam_width" value="10"/><rgb name="intensity" value="28, 26, 15"/></emitter>',
+             "perspective", FOV),
+    "directional": ('<emitter type="directional"><vector name="direction" x="-1" y="-2" z="-0.7"/><rgb name="irradiance" value="3, 2, 1"/>'
+                    '</emitter><emitter type="constant"><rgb name="radiance" value="0.1, 0.2, 0.3"/></emitter>', "perspective", FOV),
+    "disk": (DISK, "perspective", FOV),
+    "thinlens": (DISK, "thinlens", FOV + '<float name="aperture_radius" value="0.3"/><float name="focus_distance" value="4"/>'),
+    "orthographic": (DISK, "orthographic", ""),
+    "instances": (ENVMAP + '<shape type="shapegroup" id="g"><shape type="sphere"><float name="radius" value="0.2"/></shape>'
+                  '<shape type="cube"><transform name="to_world"><scale value="0.15"/><translate y="0.35"/></transform></shape></shape>'
+                  + "".join(f'<shape type="instance"><ref id="g"/><transform name="to_world"><scale value="{1 + 0.3 * i}"/><rotate z="1" '
+                            f'angle="{15 * i}"/><translate x="{i - 1.5}" y="1.4" z="0.5"/></transform></shape>' for i in range(4)),
+                  "perspective", FOV),
+}
+
+LIT = """<scene version="3.0.0">
+<default name="res" value="128"/><default name="spp" value="16"/><default name="max_depth" value="8"/>
+<integrator type="path"><integer name="max_depth" value="$max_depth"/></integrator>
+<sensor type="SENSOR">LENS
+<transform name="to_world"><scale x="2" y="2"/><lookat origin="0, 2, 5" target="0, 0.5, 0" up="0, 1, 0"/></transform>
+<sampler type="independent"><integer name="sample_count" value="$spp"/></sampler>
+<film type="hdrfilm"><integer name="width" value="$res"/><integer name="height" value="$res"/><rfilter type="box"/></film></sensor>
+<shape type="rectangle"><transform name="to_world"><rotate x="1" angle="-90"/><scale value="4"/></transform>
+<bsdf type="diffuse"><rgb name="reflectance" value="0.6, 0.5, 0.4"/></bsdf></shape>
+<shape type="sphere"><point name="center" x="-0.8" y="0.6" z="0"/><float name="radius" value="0.6"/>
+<bsdf type="diffuse"><rgb name="reflectance" value="0.3, 0.5, 0.7"/></bsdf></shape>
+<shape type="cube"><transform name="to_world"><scale value="0.4"/><rotate y="1" angle="30"/><translate x="0.8" y="0.4"/></transform>
+<bsdf type="roughconductor"><string name="material" value="Cu"/><float name="alpha" value="0.2"/></bsdf></shape>
+<shape type="cylinder"><point name="p0" x="-1.5" y="0" z="-1"/><point name="p1" x="-1" y="1.6" z="-1.2"/><float name="radius" value="0.2"/>
+<bsdf type="twosided"><bsdf type="diffuse"/></bsdf></shape>
+EMITTER
+</scene>
+"""
+
+
+def sky() -> bytes:
+    """A picture of 64 x 32 pixels in RGBE: patches of colour, dark ones among them, and a small sun."""
+    rows = bytearray(b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 32 +X 64\n")
+    for y in range(32):
+        for x in range(64):
+            a, b, c = (x * 37 + y * 91) % 256, (x * 11 + y * 57 + 80) % 256, (x * 73 + y * 23 + 160) % 256
+            if a > b > c:
+                a = b = c = 0
+            sun = (x, y) in [(20, 8), (20, 9)]
+            # no pixel begins with 2, 2 or is 1, 1, 1, which would be a run
+            rows += bytes([200, 180, 150, 137]) if sun else bytes([a | 4, b | 4, c | 4, 128])
+    return bytes(rows)
+
 
 def prepare(name: str, shared: Path, work: Path) -> Path:
     """Leaves the scene under `work` and returns its XML. Parameters: res (or resx, resy), spp, max_depth."""
@@ -75,7 +134,16 @@ def prepare(name: str, shared: Path, work: Path) -> Path:
         out = work / f"material-{name}.xml"
         out.write_text(SMALL.replace("MATERIAL", MATERIALS[name]))
         return out
-    raise SystemExit(f"unknown scene {name}; there are {', '.join([*NAMES, *MATERIALS])}, and materials for all of these")
+    if name in EMITTERS:
+        emitter, sensor, lens = EMITTERS[name]
+        (work / "sky.hdr").write_bytes(sky())
+        out = work / f"emitter-{name}.xml"
+        text = LIT.replace("SENSOR", sensor).replace("LENS", lens).replace("EMITTER", emitter)
+        # a scale of the map is the width of a parallel view; a perspective one has none
+        out.write_text(text if sensor == "orthographic" else text.replace('<scale x="2" y="2"/>', ""))
+        return out
+    there = ", ".join([*NAMES, *MATERIALS, *EMITTERS])
+    raise SystemExit(f"unknown scene {name}; there are {there}; materials or emitters for all of these")
 
 
 def parameters(xml: Path, size: int, max_depth: int) -> dict:
