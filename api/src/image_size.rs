@@ -75,7 +75,9 @@ impl schemars::JsonSchema for ImageSize {
         "ImageSize".into()
     }
     fn json_schema(_: &mut schemars::SchemaGenerator) -> schemars::Schema {
-        schemars::json_schema!({"type": "string", "pattern": "^[1-9][0-9]{0,4}x[1-9][0-9]{0,4}$"})
+        // 1 to 65535, twice
+        let side = "([1-9][0-9]{0,3}|[1-5][0-9]{4}|6[0-4][0-9]{3}|65[0-4][0-9]{2}|655[0-2][0-9]|6553[0-5])";
+        schemars::json_schema!({"type": "string", "pattern": format!("^{side}x{side}$")})
     }
 }
 

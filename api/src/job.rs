@@ -105,6 +105,17 @@ pub struct RenderJobSpec {
     /// Where a cluster keeps scenes, rays and pictures. A local run has no use for it.
     #[serde(default)]
     pub storage: StorageSpec,
+    /// Whether a cluster is not to work on the job for now: it has no workers, and goes on later from what was committed.
+    #[serde(default)]
+    pub suspend: bool,
+    /// Seconds after which a cluster gives up a job that is not done, from its start or the end of a suspension.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schemars(range(min = 1))]
+    pub active_deadline_seconds: Option<i64>,
+    /// Seconds after its end at which a cluster deletes the job, but not its pictures; never by default.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schemars(range(min = 0))]
+    pub ttl_seconds_after_finished: Option<i64>,
 }
 
 /// Where a cluster keeps scenes, rays and pictures.

@@ -17,11 +17,11 @@ pub struct RenderJobStatus {
     /// The generation of the spec that this status is of.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub observed_generation: Option<i64>,
-    /// `Accepted`, `Prepared`, `Running`, `Complete`, `Failed`.
+    /// `Accepted`, `Prepared`, `Running`, `Suspended`, `Complete`, `Failed`.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     #[schemars(extend("x-kubernetes-list-type" = "map", "x-kubernetes-list-map-keys" = ["type"]))]
     pub conditions: Vec<Condition>,
-    /// `Pending`, `Preparing`, `Rendering`, `Complete` or `Failed`.
+    /// `Pending`, `Preparing`, `Rendering`, `Suspended`, `Complete` or `Failed`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub phase: Option<String>,
     /// Camera samples made of those asked for, `42%`.
@@ -57,7 +57,7 @@ pub struct RenderJobStatus {
     /// The finished pictures.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub pictures: Vec<String>,
-    /// When work began.
+    /// When work began, or went on after a suspension.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub start_time: Option<Time>,
     /// When the first trace task was handed out.

@@ -83,6 +83,12 @@ pub fn validate(job: &RenderJob) -> Vec<Problem> {
     c.range("spec.overlapThreshold", spec.overlap_threshold, 0.0, 1.0);
     check_workers(&mut c, job);
     c.range("spec.taskSeconds", spec.task_seconds, 0.01, 3600.0);
+    c.check("spec.activeDeadlineSeconds", spec.active_deadline_seconds.is_none_or(|s| s > 0), || {
+        "must be above 0: leave it out for a job without a deadline".into()
+    });
+    c.check("spec.ttlSecondsAfterFinished", spec.ttl_seconds_after_finished.is_none_or(|s| s >= 0), || {
+        "must be 0 or more: leave it out for a job that stays".into()
+    });
     c.0
 }
 
@@ -276,6 +282,8 @@ spec:
         spec.workers.memory = Some(ByteSize::new(0));
         spec.replicas = Some(4);
         spec.task_seconds = Some(0.0);
+        spec.active_deadline_seconds = Some(0);
+        spec.ttl_seconds_after_finished = Some(-1);
         let fields: Vec<String> = validate(&job).into_iter().map(|p| p.field).collect();
         let want = [
             "apiVersion",
@@ -307,6 +315,8 @@ spec:
             "spec.workers.memory",
             "spec.replicas",
             "spec.taskSeconds",
+            "spec.activeDeadlineSeconds",
+            "spec.ttlSecondsAfterFinished",
         ];
         assert_eq!(fields, want);
     }

@@ -35,7 +35,7 @@ pub fn memory(job: &RenderJobObject) -> u64 {
     job.spec.workers.memory.map_or(DEFAULT_MEMORY, ByteSize::bytes)
 }
 
-/// The pod of a worker. `held` are the scene's bytes by node.
+/// The pod of a worker. `held` are the scene's bytes by node, `trusted` the certificates that the operator is known by.
 ///
 /// # Errors
 /// When the job has no name or uid, which the API server excludes, or the pod cannot be written down.
@@ -44,6 +44,7 @@ pub fn pod(
     config: &Config,
     storage: &Storage,
     held: &BTreeMap<String, u64>,
+    trusted: &str,
     number: u32,
     name: &str,
 ) -> Result<Pod, serde_json::Error> {
@@ -55,6 +56,7 @@ pub fn pod(
     let field = |name: &str, path: &str| json!({"name": name, "valueFrom": {"fieldRef": {"fieldPath": path}}});
     let env = vec![
         value("RAYHERD_OPERATOR", &config.url),
+        value("RAYHERD_CA", trusted),
         value("RAYHERD_JOB", &uid),
         value("RAYHERD_WORKER", &number.to_string()),
         value("RAYHERD_SLOTS", &slots.to_string()),
@@ -212,7 +214,10 @@ mod tests {
     fn config() -> Config {
         Config {
             namespace: "rayherd".into(),
-            url: "http://operator".into(),
+            pod: "operator-1".into(),
+            lease: "lease".into(),
+            authority: "authority".into(),
+            url: "https://operator".into(),
             image: "worker:1".into(),
             listen: "127.0.0.1:0".parse().unwrap(),
             metrics: "127.0.0.1:0".parse().unwrap(),
@@ -229,7 +234,7 @@ mod tests {
             endpoints: vec![Endpoint { url: "http://m".into(), node: Some("node1".into()) }],
         };
         let held = BTreeMap::from([("node1".to_owned(), 1000), ("node2".to_owned(), 1), ("node3".to_owned(), 0)]);
-        let pod = pod(&job(), &config(), &storage, &held, 1, "box-w1").unwrap();
+        let pod = pod(&job(), &config(), &storage, &held, "PEM", 1, "box-w1").unwrap();
         let spec = pod.spec.unwrap();
         assert_eq!(spec.automount_service_account_token, Some(false));
         let container = &spec.containers[0];

@@ -9,7 +9,13 @@ use anyhow::Context;
 pub struct Config {
     /// Its own namespace: where storage profiles are.
     pub namespace: String,
-    /// Address by which workers reach the task server.
+    /// The pod that this is: its name in the lease.
+    pub pod: String,
+    /// Name of the lease.
+    pub lease: String,
+    /// Name of the Secret with the certificate authority.
+    pub authority: String,
+    /// Address by which workers reach the task server, `https://HOST:PORT`.
     pub url: String,
     /// Image of the workers.
     pub image: String,
@@ -22,6 +28,16 @@ pub struct Config {
 }
 
 impl Config {
+    /// The host of [`Config::url`], which the task server's certificate is for.
+    ///
+    /// # Errors
+    /// When the address is not one of TLS.
+    pub fn host(&self) -> anyhow::Result<&str> {
+        let rest = self.url.strip_prefix("https://").unwrap_or_default();
+        let host = rest.split(['/', ':']).next().filter(|h| !h.is_empty());
+        host.with_context(|| format!("RAYHERD_URL is {:?}: give https://HOST:PORT", self.url))
+    }
+
     /// From the environment.
     ///
     /// # Errors
@@ -35,9 +51,12 @@ impl Config {
         };
         Ok(Config {
             namespace: need("RAYHERD_NAMESPACE")?,
+            pod: need("RAYHERD_POD")?,
+            lease: need("RAYHERD_LEASE")?,
+            authority: need("RAYHERD_AUTHORITY")?,
             url: need("RAYHERD_URL")?,
             image: need("RAYHERD_WORKER_IMAGE")?,
-            listen: address("RAYHERD_LISTEN", "0.0.0.0:8080")?,
+            listen: address("RAYHERD_LISTEN", "0.0.0.0:8443")?,
             metrics: address("RAYHERD_METRICS", "0.0.0.0:9090")?,
             watch: variable("RAYHERD_WATCH_NAMESPACE"),
         })

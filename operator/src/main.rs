@@ -1,9 +1,11 @@
 //! The operator: watches RenderJobs, runs their workers, plans and commits their rounds.
 
+mod authority;
 mod build;
 mod config;
 mod finish;
 mod jobs;
+mod lease;
 mod ledger;
 mod metrics;
 mod reconcile;
@@ -13,23 +15,30 @@ mod storage;
 mod tasks;
 #[cfg(test)]
 mod tests;
+mod tls;
 
 use std::process::ExitCode;
 use std::sync::Arc;
 
 use futures::StreamExt;
 use k8s_openapi::api::core::v1::Pod;
+use kube::api::{Patch, PatchParams};
 use kube::runtime::controller::Controller;
 use kube::runtime::watcher;
 use kube::{Api, Client};
-use rayherd_api::resource::{RenderJobObject, definition};
+use rayherd_api::resource::definition;
+use serde_json::json;
 use tokio::signal::unix::{SignalKind, signal};
 
 use config::Config;
+use lease::Lease;
 use reconcile::Context;
 
 /// The API server ends a watch after this many seconds; below what load balancers and proxies cut silently.
 const WATCH_SECONDS: u32 = 200;
+
+/// Marks the operator's pod that leads.
+const LEADER: &str = "rayherd.io/leader";
 
 #[tokio::main]
 async fn main() -> ExitCode {
@@ -62,11 +71,24 @@ async fn run() -> anyhow::Result<()> {
     let config = Config::from_env()?;
     let client = Client::try_default().await?;
     let context = Arc::new(Context::new(client.clone(), config)?);
-    let tasks = tokio::spawn(tasks::serve(context.clone()));
-    let metrics = tokio::spawn(metrics::serve(context.clone()));
+    let mut metrics = tokio::spawn(metrics::serve(context.clone()));
+    let Config { namespace, pod, lease, .. } = &context.config;
+    leads(&context, false).await?;
+    let lease = Arc::new(Lease::new(client.clone(), namespace, lease, pod));
+    tokio::select! {
+        () = lease.acquire() => {}
+        () = terminated() => return Ok(()),
+        done = &mut metrics => anyhow::bail!("the metrics server ended: {done:?}"),
+    }
+    lease.watch()?;
+    let of_task = lease.clone();
+    tokio::spawn(async move { of_task.keep().await });
+    let tls = tasks::open(&context).await?;
+    let tasks = tokio::spawn(tasks::serve(context.clone(), tls));
+    leads(&context, true).await?;
 
     let watch = || watcher::Config::default().timeout(WATCH_SECONDS);
-    let jobs: Api<RenderJobObject> = context.everywhere();
+    let jobs: Api<reconcile::Seen> = context.everywhere();
     let pods: Api<Pod> = context.everywhere();
     let controller = Controller::new(jobs, watch())
         .owns(pods, watch().labels(build::LABEL))
@@ -80,10 +102,26 @@ async fn run() -> anyhow::Result<()> {
     tokio::select! {
         () = controller => {}
         done = tasks => anyhow::bail!("the task server ended: {done:?}"),
-        done = metrics => anyhow::bail!("the metrics server ended: {done:?}"),
+        done = &mut metrics => anyhow::bail!("the metrics server ended: {done:?}"),
     }
     // what was committed stays; workers wait for the next operator
     context.jobs.stop_all("the operator ends");
+    for _ in 0..50 {
+        if context.jobs.all().iter().all(|j| j.is_over()) {
+            // nothing of ours writes any more: the next may begin at once
+            lease.give_back().await;
+            break;
+        }
+        tokio::time::sleep(std::time::Duration::from_millis(100)).await;
+    }
+    Ok(())
+}
+
+/// Labels our pod, which the service that workers know selects by.
+async fn leads(context: &Context, leads: bool) -> anyhow::Result<()> {
+    let pods: Api<Pod> = Api::namespaced(context.client.clone(), &context.config.namespace);
+    let patch = json!({"metadata": {"labels": {LEADER: leads.then_some("true")}}});
+    pods.patch(&context.config.pod, &PatchParams::default(), &Patch::Merge(&patch)).await?;
     Ok(())
 }
 

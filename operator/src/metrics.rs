@@ -5,7 +5,7 @@ use std::sync::Arc;
 use axum::Router;
 use axum::extract::State;
 use axum::routing::get;
-use prometheus::{Encoder, GaugeVec, Histogram, HistogramOpts, IntCounter, Opts, Registry, TextEncoder};
+use prometheus::{Encoder, GaugeVec, Histogram, HistogramOpts, IntCounter, IntCounterVec, Opts, Registry, TextEncoder};
 use rayherd_herd::report::{Kind, Op, Place};
 
 use crate::jobs::Running;
@@ -18,8 +18,9 @@ pub struct Metrics {
     pub errors: IntCounter,
     /// Jobs that were begun, or gone on with.
     pub started: IntCounter,
-    /// Requests of workers that were refused.
-    pub refused: IntCounter,
+    /// Reports that nobody waits for (any more).
+    pub ignored: IntCounter,
+    refused: IntCounterVec,
     /// How long steps take.
     pub reconcile_seconds: Histogram,
     cpu: GaugeVec,
@@ -30,6 +31,29 @@ pub struct Metrics {
     waiting: GaugeVec,
     workers: GaugeVec,
     error: GaugeVec,
+}
+
+/// Why the task server refused a request.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Refused {
+    /// No handshake: no TLS, or a client that does not trust us.
+    Tls,
+    /// No token, or none that proves a pod.
+    Token,
+    /// The token of a pod that is not the job's worker who claims to speak.
+    Pod,
+}
+
+impl Refused {
+    const ALL: [Refused; 3] = [Refused::Tls, Refused::Token, Refused::Pod];
+
+    fn name(self) -> &'static str {
+        match self {
+            Refused::Tls => "tls",
+            Refused::Token => "token",
+            Refused::Pod => "pod",
+        }
+    }
 }
 
 const JOB: [&str; 2] = ["namespace", "job"];
@@ -55,10 +79,18 @@ impl Metrics {
         let options = HistogramOpts::new("rayherd_reconcile_duration_seconds", "duration of a reconcile step");
         let reconcile_seconds = Histogram::with_opts(options.buckets(buckets))?;
         registry.register(Box::new(reconcile_seconds.clone()))?;
+        let name = "rayherd_worker_requests_refused_total";
+        let refused =
+            IntCounterVec::new(Opts::new(name, "requests to the task server that were refused"), &["reason"])?;
+        registry.register(Box::new(refused.clone()))?;
+        for reason in Refused::ALL {
+            refused.with_label_values(&[reason.name()]);
+        }
         Ok(Metrics {
             errors: counter("rayherd_reconcile_errors_total", "reconcile steps that failed")?,
             started: counter("rayherd_jobs_started_total", "jobs that were begun or gone on with")?,
-            refused: counter("rayherd_worker_requests_refused_total", "requests of workers that were refused")?,
+            ignored: counter("rayherd_worker_reports_ignored_total", "reports of work that nobody waits for")?,
+            refused,
             cpu: gauge("rayherd_job_cpu_seconds", "CPU-seconds of the workers' tasks", &JOB)?,
             remote: gauge("rayherd_job_remote_read_ratio", "scene bytes read from other nodes, of all read", &JOB)?,
             bytes: gauge("rayherd_job_bytes", "bytes moved", &["namespace", "job", "stage", "op", "kind", "place"])?,
@@ -70,6 +102,11 @@ impl Metrics {
             reconcile_seconds,
             registry,
         })
+    }
+
+    /// Counts a request that was refused.
+    pub fn refuse(&self, reason: Refused) {
+        self.refused.with_label_values(&[reason.name()]).inc();
     }
 
     /// Sets a job's metrics.

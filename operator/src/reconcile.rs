@@ -1,17 +1,21 @@
 //! One step towards what a RenderJob asks for: look, decide, apply, tell.
 
-use std::sync::Arc;
+use std::sync::{Arc, PoisonError, RwLock};
 use std::time::{Duration, Instant};
 
 use k8s_openapi::NamespaceResourceScope;
 use k8s_openapi::api::core::v1::Pod;
+use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 use k8s_openapi::jiff::Timestamp;
-use kube::api::{DeleteParams, ListParams, Patch, PatchParams};
+use kube::api::{ApiResource, DeleteParams, DynamicObject, ListParams, Patch, PatchParams, Preconditions};
+use kube::core::DeserializeGuard;
+use kube::core::error_boundary::InvalidObject;
 use kube::runtime::controller::Action;
+use kube::runtime::events::{Event, EventType, Recorder, Reporter};
 use kube::{Api, Client, Resource, ResourceExt};
 use rayherd_api::resource::{RenderJobObject, RenderJobStatus};
-use rayherd_api::validate;
-use rayherd_herd::remote::Storage;
+use rayherd_api::{RenderJobSpec, validate};
+use rayherd_herd::remote::{Storage, Turns};
 use serde_json::json;
 
 use crate::build;
@@ -29,6 +33,8 @@ const MANAGER: &str = "rayherd-operator";
 pub const FINALIZER: &str = "rayherd.io/storage";
 /// Between two looks at a job that runs.
 const LOOK: Duration = Duration::from_secs(1);
+/// Before it is looked again whether a job that was stopped has stopped.
+const SOON: Duration = Duration::from_millis(200);
 /// Before a job whose surroundings are not there (yet) is looked at again.
 const AGAIN: Duration = Duration::from_secs(10);
 
@@ -40,6 +46,12 @@ pub struct Context {
     pub config: Config,
     /// Jobs that run here.
     pub jobs: Jobs,
+    /// The certificates that workers trust, as PEM; empty until the authority is loaded.
+    pub trusted: RwLock<String>,
+    /// Who prepares which scene.
+    pub turns: Arc<Turns>,
+    /// What a person would want to know.
+    pub events: Recorder,
     /// Counts.
     pub metrics: Metrics,
 }
@@ -50,7 +62,10 @@ impl Context {
     /// # Errors
     /// When a metric cannot be registered, which a test excludes.
     pub fn new(client: Client, config: Config) -> anyhow::Result<Self> {
-        Ok(Context { client, config, jobs: Jobs::default(), metrics: Metrics::new()? })
+        let (jobs, trusted, turns) = (Jobs::default(), RwLock::default(), Arc::default());
+        let reporter = Reporter { controller: "rayherd-operator".into(), instance: Some(config.pod.clone()) };
+        let events = Recorder::new(client.clone(), reporter);
+        Ok(Context { client, config, jobs, trusted, turns, events, metrics: Metrics::new()? })
     }
     /// Objects of every namespace that is watched.
     pub fn everywhere<K>(&self) -> Api<K>
@@ -64,6 +79,9 @@ impl Context {
         }
     }
 }
+
+/// A job as a watch shows it: one that cannot be read must not hide the others.
+pub type Seen = DeserializeGuard<RenderJobObject>;
 
 /// Why a step failed; it is tried again.
 #[derive(Debug, thiserror::Error)]
@@ -92,10 +110,10 @@ fn api(action: &'static str) -> impl Fn(kube::Error) -> Error {
 }
 
 /// Tries again, later for each failure in a row; jobs that fail together do not come back together.
-pub fn failed(job: Arc<RenderJobObject>, error: &Error, context: Arc<Context>) -> Action {
+pub fn failed(job: Arc<Seen>, error: &Error, context: Arc<Context>) -> Action {
     context.metrics.errors.inc();
     tracing::warn!(job = %job.name_any(), "{error}");
-    let spread = u64::from(job.metadata.uid.as_deref().unwrap_or_default().bytes().fold(0u8, u8::wrapping_add));
+    let spread = u64::from(job.meta().uid.as_deref().unwrap_or_default().bytes().fold(0u8, u8::wrapping_add));
     Action::requeue(Duration::from_millis(3000 + 10 * spread))
 }
 
@@ -103,9 +121,12 @@ pub fn failed(job: Arc<RenderJobObject>, error: &Error, context: Arc<Context>) -
 ///
 /// # Errors
 /// When the API server or the storage does not do what is asked; the step is tried again.
-pub async fn reconcile(job: Arc<RenderJobObject>, context: Arc<Context>) -> Result<Action, Error> {
+pub async fn reconcile(job: Arc<Seen>, context: Arc<Context>) -> Result<Action, Error> {
     let since = Instant::now();
-    let result = step(&job, &context).await;
+    let result = match &job.0 {
+        Ok(job) => step(&Arc::new(job.clone()), &context).await,
+        Err(invalid) => unreadable(invalid, &context).await,
+    };
     context.metrics.reconcile_seconds.observe(since.elapsed().as_secs_f64());
     result
 }
@@ -120,13 +141,29 @@ async fn step(job: &Arc<RenderJobObject>, context: &Arc<Context>) -> Result<Acti
     if status::is_finished(job) {
         context.jobs.remove(&uid);
         remove_pods(job, context, &namespace, &uid).await?;
-        return Ok(Action::await_change());
+        return expire(job, &jobs).await;
     }
     let problems = validate(&job.job());
     if !problems.is_empty() {
         let told: Vec<String> = problems.iter().map(ToString::to_string).collect();
         let refused = status::refused(job, "Invalid", &told.join("; "), true, Timestamp::now());
-        tell(job, &jobs, refused).await?;
+        tell(job, context, &jobs, refused).await?;
+        return Ok(Action::await_change());
+    }
+    if job.spec.suspend {
+        if !stop(context, &uid, "the job is suspended") {
+            return Ok(Action::requeue(SOON));
+        }
+        remove_pods(job, context, &namespace, &uid).await?;
+        tell(job, context, &jobs, status::suspended(job, Timestamp::now())).await?;
+        return Ok(Action::await_change());
+    }
+    if status::deadline(job).is_some_and(|d| Timestamp::now() >= d) {
+        if !stop(context, &uid, "the job's deadline is over") {
+            return Ok(Action::requeue(SOON));
+        }
+        remove_pods(job, context, &namespace, &uid).await?;
+        tell(job, context, &jobs, status::late(job, Timestamp::now())).await?;
         return Ok(Action::await_change());
     }
     let running = match context.jobs.get(&uid) {
@@ -135,7 +172,7 @@ async fn step(job: &Arc<RenderJobObject>, context: &Arc<Context>) -> Result<Acti
             // the spec was changed: what was committed stays, and the new one goes on from there
             old.fleet.cancel("the job was changed");
             if !old.is_over() {
-                return Ok(Action::requeue(Duration::from_millis(200)));
+                return Ok(Action::requeue(SOON));
             }
             old.fleet.end();
             start(job, context, &jobs, &namespace, &uid).await?
@@ -143,7 +180,7 @@ async fn step(job: &Arc<RenderJobObject>, context: &Arc<Context>) -> Result<Acti
         None => match start(job, context, &jobs, &namespace, &uid).await {
             Err(Error::Storage(e @ StorageError::Missing(_))) => {
                 let refused = status::refused(job, "StorageMissing", &e.to_string(), false, Timestamp::now());
-                tell(job, &jobs, refused).await?;
+                tell(job, context, &jobs, refused).await?;
                 return Ok(Action::requeue(AGAIN));
             }
             other => other?,
@@ -160,7 +197,7 @@ async fn step(job: &Arc<RenderJobObject>, context: &Arc<Context>) -> Result<Acti
     if !over {
         keep_pods(job, context, &namespace, &uid, &running).await?;
     }
-    tell(job, &jobs, status::running(job, &running, Timestamp::now())).await?;
+    tell(job, context, &jobs, status::running(job, &running, Timestamp::now())).await?;
     context.metrics.observe(&namespace, &job.name_any(), &running);
     if over {
         context.jobs.remove(&uid);
@@ -168,6 +205,61 @@ async fn step(job: &Arc<RenderJobObject>, context: &Arc<Context>) -> Result<Acti
         return Ok(Action::await_change());
     }
     Ok(Action::requeue(LOOK))
+}
+
+/// Stops a job, if it runs here; whether it has stopped. What was committed stays.
+fn stop(context: &Context, uid: &str, why: &str) -> bool {
+    let Some(running) = context.jobs.get(uid) else { return true };
+    running.fleet.cancel(why);
+    running.fleet.end();
+    let over = running.is_over();
+    if over {
+        context.jobs.remove(uid);
+    }
+    over
+}
+
+/// Deletes a job that came to its end, when its time is over.
+async fn expire(job: &RenderJobObject, jobs: &Api<RenderJobObject>) -> Result<Action, Error> {
+    match status::stays(job, Timestamp::now()) {
+        None => return Ok(Action::await_change()),
+        Some(left) if !left.is_zero() => return Ok(Action::requeue(left)),
+        Some(_) => {}
+    }
+    // this job as it was seen, not one of the same name, and not one whose spec was changed meanwhile
+    let (uid, resource_version) = (job.metadata.uid.clone(), job.metadata.resource_version.clone());
+    let params = DeleteParams::default().preconditions(Preconditions { uid, resource_version });
+    match jobs.delete(&job.name_any(), &params).await {
+        Ok(_) => Ok(Action::await_change()),
+        Err(kube::Error::Api(e)) if matches!(e.code, 404 | 409) => Ok(Action::await_change()),
+        Err(e) => Err(api("delete the job whose time is over")(e)),
+    }
+}
+
+/// A job that the API server took and we cannot read: a number that none of ours holds, or a field of another version.
+async fn unreadable(invalid: &InvalidObject, context: &Arc<Context>) -> Result<Action, Error> {
+    let mut job = RenderJobObject::new("", RenderJobSpec::default());
+    job.metadata = invalid.metadata.clone();
+    let (namespace, uid) = (job.namespace().unwrap_or_default(), job.metadata.uid.clone().unwrap_or_default());
+    let jobs: Api<RenderJobObject> = Api::namespaced(context.client.clone(), &namespace);
+    if job.metadata.deletion_timestamp.is_some() {
+        // of its spec only the storage matters now
+        let kind = ApiResource::erase::<RenderJobObject>(&());
+        let raw: Api<DynamicObject> = Api::namespaced_with(context.client.clone(), &namespace, &kind);
+        let raw = raw.get_opt(&job.name_any()).await.map_err(api("read the job"))?;
+        let storage = raw.map(|r| r.data["spec"]["storage"].clone()).unwrap_or_default();
+        job.spec.storage = serde_json::from_value(storage).unwrap_or_default();
+        return delete(&job, context, &jobs, &uid).await;
+    }
+    if !stop(context, &uid, "the job was changed") {
+        return Ok(Action::requeue(SOON));
+    }
+    remove_pods(&job, context, &namespace, &uid).await?;
+    // a time that stays the same, so that telling it again changes nothing
+    let since = job.metadata.creation_timestamp.as_ref().map_or(Timestamp::UNIX_EPOCH, |Time(t)| *t);
+    let message = format!("the job cannot be read: {}", invalid.error);
+    tell(&job, context, &jobs, status::refused(&job, "Unreadable", &message, true, since)).await?;
+    Ok(Action::await_change())
 }
 
 /// Begins to run a job.
@@ -191,7 +283,7 @@ async fn start(
         jobs.get(&job.name_any()).await.map_err(api("read the job"))?
     };
     let job = Arc::new(job);
-    let running = run::start(context.client.clone(), job, storage, depot);
+    let running = run::start(context.client.clone(), job, storage, depot, context.turns.clone());
     context.jobs.insert(uid, running.clone());
     context.metrics.started.inc();
     Ok(running)
@@ -234,8 +326,9 @@ async fn keep_pods(
     for name in &plan.delete {
         delete_pod(&pods, name).await?;
     }
+    let trusted = context.trusted.read().unwrap_or_else(PoisonError::into_inner).clone();
     for (number, name) in &plan.make {
-        let pod = build::pod(job, &context.config, &running.storage, &held, *number, name)
+        let pod = build::pod(job, &context.config, &running.storage, &held, &trusted, *number, name)
             .map_err(|e| Error::Internal(e.to_string()))?;
         let params = PatchParams::apply(MANAGER);
         let made = pods.patch(name, &params, &Patch::Apply(&pod)).await.map_err(api("make a worker's pod"))?;
@@ -271,7 +364,12 @@ async fn remove_pods(job: &RenderJobObject, context: &Context, namespace: &str, 
 }
 
 /// Writes the status, if it says something new.
-async fn tell(job: &RenderJobObject, jobs: &Api<RenderJobObject>, status: RenderJobStatus) -> Result<(), Error> {
+async fn tell(
+    job: &RenderJobObject,
+    context: &Context,
+    jobs: &Api<RenderJobObject>,
+    status: RenderJobStatus,
+) -> Result<(), Error> {
     let known = job.status.clone().map(|s| RenderJobStatus { ledger: Vec::new(), ..s });
     if known.as_ref() == Some(&status) {
         return Ok(());
@@ -283,10 +381,25 @@ async fn tell(job: &RenderJobObject, jobs: &Api<RenderJobObject>, status: Render
     });
     let params = PatchParams::apply(MANAGER).force();
     match jobs.patch_status(&job.name_any(), &params, &Patch::Apply(&patch)).await {
-        Ok(_) => Ok(()),
-        Err(kube::Error::Api(e)) if e.code == 404 => Ok(()),
-        Err(e) => Err(api("write the status")(e)),
+        Ok(_) => {}
+        Err(kube::Error::Api(e)) if e.code == 404 => return Ok(()),
+        Err(e) => return Err(api("write the status")(e)),
     }
+    for condition in status::news(known.as_ref(), &status) {
+        let bad = condition.type_ == "Failed" || condition.status == "False";
+        let event = Event {
+            type_: if bad { EventType::Warning } else { EventType::Normal },
+            reason: if condition.type_ == "Prepared" { "Prepared".into() } else { condition.reason.clone() },
+            note: Some(condition.message.chars().take(1000).collect()),
+            action: condition.type_.clone(),
+            secondary: None,
+        };
+        // the status says it too
+        if let Err(e) = context.events.publish(&event, &job.object_ref(&())).await {
+            tracing::warn!("no event: {e}");
+        }
+    }
+    Ok(())
 }
 
 /// The job is being deleted: its thread ends, its objects go, the finalizer last.
@@ -301,13 +414,8 @@ async fn delete(
         context.jobs.remove(uid);
         return Ok(Action::await_change());
     }
-    if let Some(running) = context.jobs.get(uid) {
-        running.fleet.cancel("the job is deleted");
-        running.fleet.end();
-        if !running.is_over() {
-            return Ok(Action::requeue(Duration::from_millis(200)));
-        }
-        context.jobs.remove(uid);
+    if !stop(context, uid, "the job is deleted") {
+        return Ok(Action::requeue(SOON));
     }
     let namespace = job.namespace().unwrap_or_default();
     context.metrics.forget(&namespace, &job.name_any());

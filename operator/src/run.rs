@@ -9,7 +9,7 @@ use rayherd_api::ByteSize;
 use rayherd_api::resource::RenderJobObject;
 use rayherd_herd::job::{JobError, Progress, Status};
 use rayherd_herd::remote::frames::{Job, Keeper, run};
-use rayherd_herd::remote::{Depot, Fleet, Storage};
+use rayherd_herd::remote::{Depot, Fleet, Storage, Turns};
 use rayherd_herd::report::Report;
 use rayherd_scene::objects::ObjectRef;
 use tokio::runtime::Handle;
@@ -42,7 +42,13 @@ pub fn pictures(job: &RenderJobObject) -> Vec<String> {
 }
 
 /// Starts a job.
-pub fn start(client: Client, job: Arc<RenderJobObject>, storage: Storage, depot: Depot) -> Arc<Running> {
+pub fn start(
+    client: Client,
+    job: Arc<RenderJobObject>,
+    storage: Storage,
+    depot: Depot,
+    turns: Arc<Turns>,
+) -> Arc<Running> {
     let nanos = Timestamp::now().as_nanosecond();
     let slots = build::slots(&job);
     let session = format!("o{nanos:x}");
@@ -66,6 +72,7 @@ pub fn start(client: Client, job: Arc<RenderJobObject>, storage: Storage, depot:
             session,
             depot: &depot,
             fleet: &of_thread.fleet,
+            turns: &turns,
             slots,
             runtime,
         };

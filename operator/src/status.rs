@@ -1,7 +1,9 @@
 //! The status of a job. Pure: a function of what was known and what is known now.
 
+use std::time::Duration;
+
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::{Condition, Time};
-use k8s_openapi::jiff::Timestamp;
+use k8s_openapi::jiff::{SignedDuration, Timestamp};
 use rayherd_api::resource::{RenderJobObject, RenderJobStatus};
 use rayherd_herd::remote::fleet::Tally;
 use rayherd_herd::report::{Kind, Op, Place};
@@ -11,13 +13,84 @@ use crate::jobs::{Running, State};
 /// A job cannot be run as it stands.
 pub fn refused(job: &RenderJobObject, reason: &str, message: &str, for_good: bool, now: Timestamp) -> RenderJobStatus {
     let mut status = known(job);
-    status.phase = Some(if for_good { "Failed" } else { "Pending" }.into());
+    status.phase = Some("Pending".into());
     set(job, &mut status, "Accepted", "False", reason, message, now);
-    if for_good {
-        set(job, &mut status, "Failed", "True", reason, message, now);
-        status.completion_time.get_or_insert(Time(now));
+    if for_good { failed(job, status, reason, message, now) } else { status }
+}
+
+/// A job took too long.
+pub fn late(job: &RenderJobObject, now: Timestamp) -> RenderJobStatus {
+    let seconds = job.spec.active_deadline_seconds.unwrap_or_default();
+    let message = format!(
+        "not done {seconds} s after its start: raise spec.activeDeadlineSeconds, and it goes on from what was committed"
+    );
+    failed(job, known(job), "DeadlineExceeded", &message, now)
+}
+
+fn failed(
+    job: &RenderJobObject,
+    mut status: RenderJobStatus,
+    reason: &str,
+    message: &str,
+    now: Timestamp,
+) -> RenderJobStatus {
+    status.phase = Some("Failed".into());
+    status.workers = None;
+    if status.conditions.iter().any(|c| c.type_ == "Running") {
+        set(job, &mut status, "Running", "False", "Failed", "", now);
     }
+    set(job, &mut status, "Failed", "True", reason, message, now);
+    status.conditions.retain(|c| c.type_ != "Complete");
+    status.completion_time.get_or_insert(Time(now));
     status
+}
+
+/// A job is not to be worked on for now. When it goes on, its time begins anew.
+pub fn suspended(job: &RenderJobObject, now: Timestamp) -> RenderJobStatus {
+    let mut status = known(job);
+    status.phase = Some("Suspended".into());
+    status.workers = None;
+    (status.start_time, status.completion_time) = (None, None);
+    set(job, &mut status, "Running", "False", "Suspended", "", now);
+    set(job, &mut status, "Suspended", "True", "Suspended", "spec.suspend is true", now);
+    status.conditions.retain(|c| !matches!(c.type_.as_str(), "Complete" | "Failed"));
+    status
+}
+
+/// When a job that runs is given up, if ever.
+pub fn deadline(job: &RenderJobObject) -> Option<Timestamp> {
+    let seconds = job.spec.active_deadline_seconds?;
+    let status = job.status.as_ref()?;
+    // a job that was at its end, and has a new spec, has not begun yet
+    if status.completion_time.is_some() {
+        return None;
+    }
+    let Time(start) = status.start_time.as_ref()?;
+    start.checked_add(SignedDuration::from_secs(seconds)).ok()
+}
+
+/// How long a job that came to its end stays; none for ever.
+pub fn stays(job: &RenderJobObject, now: Timestamp) -> Option<Duration> {
+    let seconds = job.spec.ttl_seconds_after_finished?;
+    let Time(end) = job.status.as_ref()?.completion_time.as_ref()?;
+    let until = end.checked_add(SignedDuration::from_secs(seconds)).ok()?;
+    Some(Duration::try_from(until.duration_since(now)).unwrap_or_default())
+}
+
+/// What a person would want to know of a change: the conditions that were not as they are now.
+pub fn news<'s>(known: Option<&RenderJobStatus>, status: &'s RenderJobStatus) -> Vec<&'s Condition> {
+    let was = |c: &Condition| {
+        let old = known.and_then(|k| k.conditions.iter().find(|o| o.type_ == c.type_));
+        old.is_some_and(|o| (&o.status, &o.reason) == (&c.status, &c.reason))
+    };
+    let has_failed = status.phase.as_deref() == Some("Failed");
+    let telling = |c: &&Condition| match (c.type_.as_str(), c.status.as_str()) {
+        ("Prepared" | "Suspended" | "Complete" | "Failed", "True") => true,
+        // what fails says so once
+        ("Accepted", "False") => !has_failed,
+        _ => false,
+    };
+    status.conditions.iter().filter(telling).filter(|c| !was(c)).collect()
 }
 
 /// A job runs here, or has run.
@@ -67,7 +140,9 @@ fn of(
     status.workers = Some(format!("{ready}/{wanted}"));
     status.scene = state.scene.clone().or(status.scene);
     status.locality = Some(if local { "per node" } else { "none" }.into());
-    status.start_time = status.start_time.or(state.started.map(Time));
+    // one that was at its end begins anew
+    let began = status.start_time.filter(|_| status.completion_time.is_none());
+    status.start_time = began.or(state.started.map(Time));
     status.first_task_time = status.first_task_time.or(state.first_task.map(Time));
     if !state.pictures.is_empty() {
         status.pictures.clone_from(&state.pictures);
@@ -77,6 +152,9 @@ fn of(
         let (reason, message) =
             if state.reused { ("Found", "the scene was prepared before") } else { ("Made", "the scene was prepared") };
         set(job, &mut status, "Prepared", "True", reason, message, now);
+    }
+    if status.conditions.iter().any(|c| c.type_ == "Suspended") {
+        set(job, &mut status, "Suspended", "False", "Resumed", "", now);
     }
     let is = |yes: bool| if yes { "True" } else { "False" };
     set(job, &mut status, "Running", is(matches!(phase, "Preparing" | "Rendering")), phase, "", now);
@@ -139,4 +217,80 @@ pub fn is_finished(job: &RenderJobObject) -> bool {
     let Some(status) = &job.status else { return false };
     status.observed_generation == job.metadata.generation
         && matches!(status.phase.as_deref(), Some("Complete" | "Failed"))
+}
+
+#[cfg(test)]
+mod tests {
+    use serde_json::json;
+
+    use super::*;
+
+    fn job(status: serde_json::Value) -> RenderJobObject {
+        serde_json::from_value(json!({
+            "apiVersion": "rayherd.io/v1alpha1",
+            "kind": "RenderJob",
+            "metadata": {"name": "box", "namespace": "studio", "uid": "u-1", "generation": 2},
+            "spec": {"scene": {"source": "a/b.xml"}, "activeDeadlineSeconds": 60, "ttlSecondsAfterFinished": 30},
+            "status": status,
+        }))
+        .unwrap()
+    }
+
+    fn at(second: i64) -> Timestamp {
+        Timestamp::from_second(1_800_000_000 + second).unwrap()
+    }
+
+    #[test]
+    fn time_counts_from_the_start_and_anew_after_a_suspension_or_an_end() {
+        let begun = json!({"startTime": at(0).to_string()});
+        assert_eq!(deadline(&job(begun.clone())), Some(at(60)));
+        assert_eq!(deadline(&job(json!({}))), None);
+        let mut without = job(begun.clone());
+        without.spec.active_deadline_seconds = None;
+        assert_eq!(deadline(&without), None);
+        let slept = suspended(&job(begun.clone()), at(10));
+        assert_eq!((slept.start_time.clone(), slept.phase.as_deref()), (None, Some("Suspended")));
+        let given_up = late(&job(begun), at(61));
+        assert_eq!(given_up.completion_time, Some(Time(at(61))));
+        // a higher deadline: it begins anew
+        let again = job(serde_json::to_value(&given_up).unwrap());
+        assert_eq!(deadline(&again), None);
+        let state = State { started: Some(at(100)), ..State::default() };
+        let runs = of(&again, &state, &Tally::default(), 1, true, at(100));
+        assert_eq!((runs.start_time.clone(), runs.completion_time), (Some(Time(at(100))), None));
+        assert_eq!(deadline(&job(json!({"startTime": runs.start_time}))), Some(at(160)));
+        // and what was suspended says that it is no longer
+        let resumed = of(&job(serde_json::to_value(&slept).unwrap()), &state, &Tally::default(), 1, true, at(100));
+        let condition = resumed.conditions.iter().find(|c| c.type_ == "Suspended").unwrap();
+        assert_eq!((condition.status.as_str(), condition.reason.as_str()), ("False", "Resumed"));
+    }
+
+    #[test]
+    fn a_job_at_its_end_stays_for_its_time() {
+        let ended = job(json!({"completionTime": at(0).to_string()}));
+        assert_eq!(stays(&ended, at(10)), Some(Duration::from_secs(20)));
+        assert_eq!(stays(&ended, at(31)), Some(Duration::ZERO));
+        let mut without = ended.clone();
+        without.spec.ttl_seconds_after_finished = None;
+        assert_eq!(stays(&without, at(31)), None);
+    }
+
+    #[test]
+    fn each_change_is_told_once() {
+        let told = |known: Option<&RenderJobStatus>, status: &RenderJobStatus| -> Vec<String> {
+            news(known, status).iter().map(|c| c.type_.clone()).collect()
+        };
+        let new = job(json!({}));
+        let waiting = refused(&new, "StorageMissing", "no", false, at(0));
+        assert_eq!(told(None, &waiting), ["Accepted"]);
+        assert_eq!(told(Some(&waiting), &waiting), [""; 0]);
+        assert_eq!(told(Some(&waiting), &refused(&new, "Invalid", "no", true, at(0))), ["Failed"]);
+        let mut state = State { scene: Some("s".into()), ..State::default() };
+        let prepared = of(&new, &state, &Tally::default(), 1, true, at(0));
+        assert_eq!(told(None, &prepared), ["Prepared"]);
+        state.end = Some((at(1), Ok(())));
+        let complete = of(&new, &state, &Tally::default(), 1, true, at(1));
+        assert_eq!(told(Some(&prepared), &complete), ["Complete"]);
+        assert_eq!(told(Some(&complete), &suspended(&new, at(2))), ["Suspended"]);
+    }
 }

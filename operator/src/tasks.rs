@@ -9,15 +9,22 @@ use axum::http::{HeaderMap, StatusCode};
 use axum::routing::post;
 use axum::{Json, Router};
 use k8s_openapi::api::authentication::v1::{TokenReview, TokenReviewSpec};
+use k8s_openapi::jiff::Timestamp;
 use kube::Api;
 use kube::api::PostParams;
 use rayherd_herd::remote::fleet::Unknown;
 use rayherd_herd::remote::{Answer, Beat, Poll, Report, WorkerId};
 
+use crate::authority::{self, Serving};
 use crate::build::AUDIENCE;
+use crate::config::Config;
 use crate::jobs::Running;
+use crate::metrics::Refused;
 use crate::reconcile::Context;
+use crate::tls::{Current, Tls};
 
+/// Between two looks whether the certificate is to be renewed.
+const HOUR: Duration = Duration::from_secs(3600);
 /// How long a question stays open: below what proxies cut.
 const PATIENCE: Duration = Duration::from_secs(20);
 /// How long a reviewed token is believed: a pod that is deleted is heard no longer than this.
@@ -38,10 +45,49 @@ struct Server {
 
 type Refusal = (StatusCode, String);
 
+/// Begins to listen, with a certificate of the operator's authority. Workers that are started from now on trust it.
+pub async fn open(context: &Arc<Context>) -> anyhow::Result<Tls> {
+    let serving = certificate(context).await?;
+    let current = Current::new(serving.key);
+    let of_counter = context.clone();
+    let refused = move || of_counter.metrics.refuse(Refused::Tls);
+    let tls = Tls::listen(context.config.listen, current.clone(), refused).await?;
+    tokio::spawn(renew(context.clone(), current, serving.renew));
+    Ok(tls)
+}
+
+/// Loads or renews the authority; a certificate of it.
+async fn certificate(context: &Context) -> anyhow::Result<Serving> {
+    let Config { namespace, authority, .. } = &context.config;
+    let now = Timestamp::now().as_second();
+    let roots = authority::load(&context.client, namespace, authority, now).await?;
+    *context.trusted.write().unwrap_or_else(PoisonError::into_inner) = roots.bundle();
+    Ok(roots.serving(context.config.host()?, now)?)
+}
+
+/// Has another certificate each half of its life, for as long as the process lives.
+async fn renew(context: Arc<Context>, current: Arc<Current>, mut due: i64) {
+    loop {
+        tokio::time::sleep(HOUR).await;
+        if Timestamp::now().as_second() < due {
+            continue;
+        }
+        match certificate(&context).await {
+            Ok(serving) => {
+                current.set(serving.key);
+                due = serving.renew;
+            }
+            Err(e) => {
+                context.metrics.errors.inc();
+                tracing::error!("the certificate is not renewed, which is tried again in an hour: {e:#}");
+            }
+        }
+    }
+}
+
 /// Serves until the process ends.
-pub async fn serve(context: Arc<Context>) -> anyhow::Result<()> {
-    let listener = tokio::net::TcpListener::bind(context.config.listen).await?;
-    Ok(axum::serve(listener, router(context)).await?)
+pub async fn serve(context: Arc<Context>, tls: Tls) -> anyhow::Result<()> {
+    Ok(axum::serve(tls, router(context)).await?)
 }
 
 fn router(context: Arc<Context>) -> Router {
@@ -71,7 +117,11 @@ async fn report(
     Json(report): Json<Report>,
 ) -> Result<Json<bool>, Refusal> {
     let running = server.hear(&uid, &headers, &report.worker).await?;
-    running.fleet.report(report).map(Json).map_err(unknown)
+    let taken = running.fleet.report(report).map_err(unknown)?;
+    if !taken {
+        server.context.metrics.ignored.inc();
+    }
+    Ok(Json(taken))
 }
 
 async fn beat(
@@ -91,13 +141,13 @@ fn unknown(e: Unknown) -> Refusal {
 impl Server {
     /// The job, if it is a pod of this job and of this worker who speaks.
     async fn hear(&self, uid: &str, headers: &HeaderMap, worker: &WorkerId) -> Result<Arc<Running>, Refusal> {
-        let refuse = |status: StatusCode, why: &str| {
-            self.context.metrics.refused.inc();
+        let refuse = |status: StatusCode, reason: Refused, why: &str| {
+            self.context.metrics.refuse(reason);
             (status, why.to_owned())
         };
         let header = headers.get("authorization").and_then(|h| h.to_str().ok());
         let Some(token) = header.and_then(|h| h.strip_prefix("Bearer ")) else {
-            return Err(refuse(StatusCode::UNAUTHORIZED, "no token"));
+            return Err(refuse(StatusCode::UNAUTHORIZED, Refused::Token, "no token"));
         };
         // before the job is looked for: who proves nothing learns nothing
         let proof = self.review(token).await?;
@@ -108,8 +158,8 @@ impl Server {
         let number = running.lock().pods.get(&proof.pod_uid).copied();
         match number {
             Some(number) if number == worker.number => Ok(running),
-            Some(_) => Err(refuse(StatusCode::FORBIDDEN, "the token is another worker's")),
-            None => Err(refuse(StatusCode::FORBIDDEN, "the token is of no pod of this job")),
+            Some(_) => Err(refuse(StatusCode::FORBIDDEN, Refused::Pod, "the token is another worker's")),
+            None => Err(refuse(StatusCode::FORBIDDEN, Refused::Pod, "the token is of no pod of this job")),
         }
     }
 
@@ -128,7 +178,7 @@ impl Server {
         let answer = reviews.create(&PostParams::default(), &review).await;
         let answer = answer.map_err(|e| (StatusCode::SERVICE_UNAVAILABLE, format!("cannot review the token: {e}")))?;
         let proof = proof(&answer).ok_or_else(|| {
-            self.context.metrics.refused.inc();
+            self.context.metrics.refuse(Refused::Token);
             (StatusCode::UNAUTHORIZED, "the token proves no pod".to_owned())
         })?;
         let entry = (Instant::now(), proof.clone());

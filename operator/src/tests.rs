@@ -15,7 +15,7 @@ use tower_test::mock::{self, Handle as Mock};
 
 use crate::config::Config;
 use crate::ledger::Ledger;
-use crate::reconcile::{Context, FINALIZER, reconcile};
+use crate::reconcile::{Context, FINALIZER, Seen, reconcile};
 
 /// One request that must come, and its answer.
 struct Step {
@@ -77,7 +77,10 @@ fn context() -> (Arc<Context>, Server) {
     let (service, server) = mock::pair::<Request<Body>, Response<Body>>();
     let config = Config {
         namespace: "rayherd".into(),
-        url: "http://operator:8080".into(),
+        pod: "operator-1".into(),
+        lease: "lease".into(),
+        authority: "authority".into(),
+        url: "https://operator:8443".into(),
         image: "worker:1".into(),
         listen: "127.0.0.1:0".parse().unwrap(),
         metrics: "127.0.0.1:0".parse().unwrap(),
@@ -111,6 +114,15 @@ fn no_pods() -> Value {
     json!({"kind": "PodList", "apiVersion": "v1", "metadata": {}, "items": []})
 }
 
+/// An event is published.
+fn event(kind: &'static str, reason: &'static str) -> Step {
+    let path = "/apis/events.k8s.io/v1/namespaces/studio/events?";
+    step("POST", path, 201, json!({"metadata": {}, "eventTime": null}))
+        .with("/type", json!(kind))
+        .with("/reason", json!(reason))
+        .with("/regarding/uid", json!("u-1"))
+}
+
 const STATUS: &str = "/apis/rayherd.io/v1alpha1/namespaces/studio/renderjobs/box/status?";
 const JOB: &str = "/apis/rayherd.io/v1alpha1/namespaces/studio/renderjobs/box?";
 const PROFILE: &str = "/api/v1/namespaces/rayherd/configmaps/rayherd-storage-default";
@@ -120,7 +132,8 @@ const PODS: &str = "/api/v1/namespaces/studio/pods?&labelSelector=rayherd.io%2Fj
 async fn scenario(job: &Value, steps: Vec<Step>) -> (Result<Action, String>, Vec<Value>, Arc<Context>) {
     let (context, server) = context();
     let serving = tokio::spawn(serve(server, steps));
-    let done = reconcile(object(job), context.clone()).await.map_err(|e| e.to_string());
+    let seen: Seen = serde_json::from_value(job.clone()).unwrap();
+    let done = reconcile(Arc::new(seen), context.clone()).await.map_err(|e| e.to_string());
     (done, serving.await.unwrap(), context)
 }
 
@@ -132,7 +145,7 @@ async fn a_bad_job_fails_with_what_to_do_and_nothing_is_made() {
         .with("/status/phase", json!("Failed"))
         .with("/status/observedGeneration", json!(3))
         .with("/status/conditions/0/status", json!("False"));
-    let (done, said, _) = scenario(&bad, vec![tell]).await;
+    let (done, said, _) = scenario(&bad, vec![tell, event("Warning", "Invalid")]).await;
     assert_eq!(done, Ok(Action::await_change()));
     assert!(said[0].to_string().contains("spec.sampling.spp: is 0"), "{}", said[0]);
     // told once: the same again is silence but for a look at what pods are left
@@ -145,7 +158,8 @@ async fn a_bad_job_fails_with_what_to_do_and_nothing_is_made() {
 #[tokio::test]
 async fn a_job_without_its_storage_waits_and_says_for_what() {
     let tell = step("PATCH", STATUS, 200, job()).with("/status/phase", json!("Pending"));
-    let (done, said, _) = scenario(&job(), vec![step("GET", PROFILE, 404, not_found()), tell]).await;
+    let steps = vec![step("GET", PROFILE, 404, not_found()), tell, event("Warning", "StorageMissing")];
+    let (done, said, _) = scenario(&job(), steps).await;
     assert_ne!(done.unwrap(), Action::await_change());
     assert!(said[1].to_string().contains("rayherd-storage-default is not there"), "{}", said[1]);
     let mut told = job();
@@ -221,6 +235,83 @@ async fn a_deleted_job_goes_even_when_its_storage_went_first() {
         step("PATCH", JOB, 200, deleted.clone()).with("/metadata/finalizers", json!(["other/one"])),
     ];
     let (done, ..) = scenario(&deleted, steps).await;
+    assert_eq!(done, Ok(Action::await_change()));
+}
+
+#[tokio::test]
+async fn a_suspended_job_has_no_workers_and_is_told_once() {
+    let mut suspended = job();
+    suspended["spec"]["suspend"] = json!(true);
+    suspended["status"] = json!({"phase": "Rendering", "startTime": "2026-01-01T00:00:00Z", "progress": "40%"});
+    let pods =
+        json!({"kind": "PodList", "apiVersion": "v1", "metadata": {}, "items": [{"metadata": {"name": "box-w0"}}]});
+    let pod = json!({"kind": "Pod", "apiVersion": "v1", "metadata": {"name": "box-w0"}});
+    let steps = vec![
+        step("GET", PODS, 200, pods),
+        step("DELETE", "/api/v1/namespaces/studio/pods/box-w0?", 200, pod),
+        step("PATCH", STATUS, 200, suspended.clone())
+            .with("/status/phase", json!("Suspended"))
+            .with("/status/progress", json!("40%")),
+        event("Normal", "Suspended"),
+    ];
+    let (done, said, _) = scenario(&suspended, steps).await;
+    assert_eq!(done, Ok(Action::await_change()));
+    assert!(said[2]["status"].get("startTime").is_none(), "its time begins anew when it goes on");
+    suspended["status"] = said[2]["status"].clone();
+    let (done, ..) = scenario(&suspended, vec![step("GET", PODS, 200, no_pods())]).await;
+    assert_eq!(done, Ok(Action::await_change()));
+}
+
+#[tokio::test]
+async fn a_job_that_took_too_long_fails_and_one_whose_time_is_over_is_deleted() {
+    let mut late = job();
+    late["spec"]["activeDeadlineSeconds"] = json!(60);
+    late["spec"]["ttlSecondsAfterFinished"] = json!(3600);
+    late["status"] = json!({"phase": "Rendering", "startTime": "2026-01-01T00:00:00Z", "observedGeneration": 3});
+    let steps = vec![
+        step("GET", PODS, 200, no_pods()),
+        step("PATCH", STATUS, 200, late.clone()).with("/status/phase", json!("Failed")),
+        event("Warning", "DeadlineExceeded"),
+    ];
+    let (done, said, _) = scenario(&late, steps).await;
+    assert_eq!(done, Ok(Action::await_change()), "its end is seen by the watch, and then its time begins");
+    late["status"] = said[1]["status"].clone();
+    let (done, ..) = scenario(&late, vec![step("GET", PODS, 200, no_pods())]).await;
+    assert_ne!(done.unwrap(), Action::await_change(), "it is looked at again in an hour");
+    late["status"]["completionTime"] = json!("2026-01-01T00:01:00Z");
+    let gone = step("DELETE", JOB, 200, late.clone())
+        .with("/preconditions/uid", json!("u-1"))
+        .with("/preconditions/resourceVersion", json!("7"));
+    let (done, ..) = scenario(&late, vec![step("GET", PODS, 200, no_pods()), gone]).await;
+    assert_eq!(done, Ok(Action::await_change()));
+}
+
+#[tokio::test]
+async fn a_job_that_cannot_be_read_fails_alone() {
+    let mut bad = job();
+    bad["metadata"]["creationTimestamp"] = json!("2026-01-01T00:00:00Z");
+    bad["spec"]["workers"] = json!({"memory": "99999999999E"});
+    let steps = || {
+        let tell = step("PATCH", STATUS, 200, bad.clone())
+            .with("/status/phase", json!("Failed"))
+            .with("/status/completionTime", json!("2026-01-01T00:00:00Z"));
+        vec![step("GET", PODS, 200, no_pods()), tell, event("Warning", "Unreadable")]
+    };
+    let (done, said, _) = scenario(&bad, steps()).await;
+    assert_eq!(done, Ok(Action::await_change()));
+    assert!(said[1].to_string().contains("is no size"), "{}", said[1]);
+    let (_, again, _) = scenario(&bad, steps()).await;
+    assert_eq!(said[1], again[1], "the same again, which changes nothing");
+    // its storage is cleaned all the same
+    bad["metadata"]["deletionTimestamp"] = json!("2026-01-01T00:00:00Z");
+    bad["metadata"]["finalizers"] = json!([FINALIZER]);
+    bad["spec"]["storage"] = json!({"profile": "other"});
+    let steps = vec![
+        step("GET", GET_JOB, 200, bad.clone()),
+        step("GET", "/api/v1/namespaces/rayherd/configmaps/rayherd-storage-other", 404, not_found()),
+        step("PATCH", JOB, 200, bad.clone()).with("/metadata/finalizers", json!([])),
+    ];
+    let (done, ..) = scenario(&bad, steps).await;
     assert_eq!(done, Ok(Action::await_change()));
 }
 

@@ -26,9 +26,9 @@ pub struct Config {
     /// A folder of its own.
     pub scratch: PathBuf,
     /// The token that proves which pod this is; it is renewed in place.
-    pub token: Option<PathBuf>,
-    /// The authority that signed the operator's certificate.
-    pub authority: Option<PathBuf>,
+    pub token: PathBuf,
+    /// Certificates of the authority that the operator's is signed by, as PEM. No other is trusted.
+    pub authority: String,
 }
 
 impl Config {
@@ -63,8 +63,8 @@ impl Config {
                 session_token: variable("AWS_SESSION_TOKEN"),
             },
             scratch: need("RAYHERD_SCRATCH")?.into(),
-            token: variable("RAYHERD_TOKEN_FILE").map(PathBuf::from),
-            authority: variable("RAYHERD_CA_FILE").map(PathBuf::from),
+            token: need("RAYHERD_TOKEN_FILE")?.into(),
+            authority: need("RAYHERD_CA")?,
         })
     }
 }
@@ -90,6 +90,8 @@ mod tests {
             ("AWS_ACCESS_KEY_ID", "a"),
             ("AWS_SECRET_ACCESS_KEY", "b"),
             ("RAYHERD_SCRATCH", "/scratch"),
+            ("RAYHERD_TOKEN_FILE", "/token"),
+            ("RAYHERD_CA", "PEM"),
         ])
     }
 

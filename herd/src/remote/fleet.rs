@@ -118,6 +118,13 @@ impl Fleet {
         self.lock().cancelled = Some(why.to_owned());
         self.told.notify_all();
     }
+    /// Whether the job is to go on.
+    ///
+    /// # Errors
+    /// When it was cancelled.
+    pub fn check(&self) -> Result<(), JobError> {
+        self.lock().check()
+    }
     /// What was done so far.
     pub fn tally(&self) -> Tally {
         let state = self.lock();

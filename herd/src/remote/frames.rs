@@ -10,7 +10,7 @@ use tokio::runtime::Handle;
 
 use super::message::{Done, Stage, Work};
 use super::parts::Parts;
-use super::{Depot, Fleet};
+use super::{Depot, Fleet, Turns};
 use crate::driver::{Driver, Pointer, Start};
 use crate::job::{JobError, JobSettings, NodeSpec, PreparedScene, Progress, Sampling, spec as from_spec};
 use crate::ledger::{FilmRef, Ledger, Snapshot, newest};
@@ -55,6 +55,8 @@ pub struct Job<'a> {
     pub depot: &'a Depot,
     /// Its workers.
     pub fleet: &'a Fleet,
+    /// Who prepares which scene.
+    pub turns: &'a Turns,
     /// Slots of each worker.
     pub slots: Vec<u32>,
     /// Where input and output runs; not the caller's thread.
@@ -69,9 +71,12 @@ pub fn run(job: &Job, keeper: &Arc<dyn Keeper>, progress: &dyn Progress) -> Resu
     let spec = job.spec;
     let replicas = spec.replicas.map_or(1, |r| r as u32).clamp(1, job.depot.len());
     let prepare = Work::Prepare { spec: Box::new(spec.clone()), replicas };
+    // of two jobs that come at once with one scene, the second finds it prepared
+    let turn = job.turns.take(&spec.scene.source, || job.fleet.check())?;
     let Done::Prepared { scene: reference, reused } = job.fleet.call(prepare)? else {
         return Err(JobError::Internal("a worker reports something else than it was to do".into()));
     };
+    drop(turn);
     keeper.prepared(&reference, reused);
     let store = Arc::new(job.depot.replicated(replicas)?);
     let objects: Arc<dyn ObjectStore> = Arc::new(SceneObjects::new(store, job.runtime.clone())?);

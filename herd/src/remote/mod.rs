@@ -14,9 +14,11 @@ pub mod station;
 pub mod storage;
 #[cfg(test)]
 mod tests;
+pub mod turns;
 
 pub use depot::Depot;
 pub use fleet::Fleet;
 pub use message::{Answer, Beat, Failure, Poll, Report, Stage, Work, WorkerId};
 pub use station::{Link, LinkError, Station};
 pub use storage::{Endpoint, Storage};
+pub use turns::Turns;

@@ -13,7 +13,7 @@ use tokio::runtime::{Handle, Runtime};
 
 use super::frames::{Job, Keeper, run};
 use super::message::{Answer, Beat, Poll, Report, WorkerId};
-use super::{Depot, Fleet, Link, LinkError, Station};
+use super::{Depot, Fleet, Link, LinkError, Station, Turns};
 use crate::job::{JobError, JobSettings, PreparedScene, Sampling, Silent, spec as from_spec};
 use crate::local::render_local;
 use crate::picture;
@@ -136,14 +136,15 @@ struct Cluster {
     stores: Vec<Arc<Faulty>>,
     runtime: Runtime,
     scratch: tempfile::TempDir,
+    turns: Turns,
 }
 
 impl Cluster {
     fn new(nodes: usize) -> Self {
         let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build().unwrap();
         let memory = || Arc::new(Faulty::new(Arc::new(MemoryStore::default()), FaultPlan::default()));
-        let cluster =
-            Cluster { stores: (0..nodes).map(|_| memory()).collect(), runtime, scratch: tempfile::tempdir().unwrap() };
+        let stores = (0..nodes).map(|_| memory()).collect();
+        let cluster = Cluster { stores, runtime, scratch: tempfile::tempdir().unwrap(), turns: Turns::default() };
         cluster.runtime.block_on(cluster.stores[0].put(SOURCE, CORNELL.clone().into())).unwrap();
         cluster.runtime.block_on(cluster.stores[0].put(TEXTURE, wall().into())).unwrap();
         cluster
@@ -151,7 +152,7 @@ impl Cluster {
     fn depot(&self, home: Option<u32>) -> Depot {
         Depot::new(self.stores.iter().map(|s| s.clone() as Arc<dyn BlockStore>).collect(), home).unwrap()
     }
-    fn job<'a>(&self, spec: &'a RenderJobSpec, depot: &'a Depot, fleet: &'a Fleet, session: &str) -> Job<'a> {
+    fn job<'a>(&'a self, spec: &'a RenderJobSpec, depot: &'a Depot, fleet: &'a Fleet, session: &str) -> Job<'a> {
         Job {
             spec,
             pictures: vec!["out/a.exr".into()],
@@ -159,6 +160,7 @@ impl Cluster {
             session: session.into(),
             depot,
             fleet,
+            turns: &self.turns,
             slots: vec![1; 3],
             runtime: self.runtime.handle().clone(),
         }
