@@ -160,14 +160,13 @@ impl Roots {
         Some(Roots { signs: root("signs")?, next: root("next") })
     }
 
-    fn to_secret(&self, name: &str, version: Option<String>) -> Secret {
+    fn to_secret(&self, metadata: ObjectMeta) -> Secret {
         let roots = [("signs", Some(&self.signs)), ("next", self.next.as_ref())];
         let all = roots.into_iter().filter_map(|(name, root)| Some((name, root?)));
         let data = all.flat_map(|(name, root)| {
             let entry = |end: &str, text: &str| (format!("{name}.{end}"), ByteString(text.as_bytes().to_vec()));
             [entry("crt", &root.certificate), entry("key", &root.key), entry("until", &root.until.to_string())]
         });
-        let metadata = ObjectMeta { name: Some(name.into()), resource_version: version, ..ObjectMeta::default() };
         Secret { metadata, data: Some(data.collect()), ..Secret::default() }
     }
 }
@@ -193,8 +192,11 @@ pub async fn load(client: &Client, namespace: &str, name: &str, now: i64) -> Res
         }
         let post = PostParams::default();
         let written = match found {
-            None => secrets.create(&post, &roots.to_secret(name, None)).await,
-            Some(old) => secrets.replace(name, &post, &roots.to_secret(name, old.metadata.resource_version)).await,
+            None => {
+                let metadata = ObjectMeta { name: Some(name.into()), ..ObjectMeta::default() };
+                secrets.create(&post, &roots.to_secret(metadata)).await
+            }
+            Some(old) => secrets.replace(name, &post, &roots.to_secret(old.metadata)).await,
         };
         tries += 1;
         match written {
@@ -223,12 +225,12 @@ mod tests {
         let second = Roots::renewed(Some(both.clone()), begin + ROOT - CHANGE + DAY).unwrap();
         assert_eq!((Some(&second.signs), &second.next), (both.next.as_ref(), &None));
         for roots in [&first, &both, &second] {
-            assert_eq!(Roots::from_secret(&roots.to_secret("a", None)).as_ref(), Some(roots));
+            assert_eq!(Roots::from_secret(&roots.to_secret(ObjectMeta::default())).as_ref(), Some(roots));
         }
         // slept through all of it
         let late = Roots::renewed(Some(first.clone()), begin + ROOT + DAY).unwrap();
         assert_ne!(late.signs, first.signs);
-        let mut damaged = first.to_secret("a", None);
+        let mut damaged = first.to_secret(ObjectMeta::default());
         damaged.data.as_mut().unwrap().remove("signs.key");
         assert_eq!(Roots::from_secret(&damaged), None);
     }

@@ -12,7 +12,7 @@ use std::time::{Duration, Instant};
 use k8s_openapi::api::coordination::v1::{Lease as LeaseObject, LeaseSpec};
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::MicroTime;
 use k8s_openapi::jiff::Timestamp;
-use kube::api::{ObjectMeta, PostParams};
+use kube::api::PostParams;
 use kube::{Api, Client};
 
 /// Unchanged for so long: whoever held it has stopped.
@@ -146,11 +146,9 @@ impl Lease {
         let now = Some(MicroTime(Timestamp::now()));
         let was = old.and_then(|l| l.spec.clone()).unwrap_or_default();
         let same = was.holder_identity.as_deref() == holder;
-        let metadata = ObjectMeta {
-            name: Some(self.name.clone()),
-            resource_version: old.and_then(|l| l.metadata.resource_version.clone()),
-            ..ObjectMeta::default()
-        };
+        // with its version, and whatever others have put there
+        let mut metadata = old.map(|l| l.metadata.clone()).unwrap_or_default();
+        metadata.name = Some(self.name.clone());
         let spec = LeaseSpec {
             holder_identity: Some(holder.unwrap_or_default().into()),
             lease_duration_seconds: Some(TAKE.as_secs() as i32),

@@ -134,7 +134,7 @@ pub async fn reconcile(job: Arc<Seen>, context: Arc<Context>) -> Result<Action, 
 async fn step(job: &Arc<RenderJobObject>, context: &Arc<Context>) -> Result<Action, Error> {
     let namespace = job.namespace().unwrap_or_default();
     let uid = job.metadata.uid.clone().unwrap_or_default();
-    let jobs: Api<RenderJobObject> = Api::namespaced(context.client.clone(), &namespace);
+    let jobs: Api<Seen> = Api::namespaced(context.client.clone(), &namespace);
     if job.metadata.deletion_timestamp.is_some() {
         return delete(job, context, &jobs, &uid).await;
     }
@@ -175,9 +175,9 @@ async fn step(job: &Arc<RenderJobObject>, context: &Arc<Context>) -> Result<Acti
                 return Ok(Action::requeue(SOON));
             }
             old.fleet.end();
-            start(job, context, &jobs, &namespace, &uid).await?
+            start(job, context, &namespace, &uid).await?
         }
-        None => match start(job, context, &jobs, &namespace, &uid).await {
+        None => match start(job, context, &namespace, &uid).await {
             Err(Error::Storage(e @ StorageError::Missing(_))) => {
                 let refused = status::refused(job, "StorageMissing", &e.to_string(), false, Timestamp::now());
                 tell(job, context, &jobs, refused).await?;
@@ -220,7 +220,7 @@ fn stop(context: &Context, uid: &str, why: &str) -> bool {
 }
 
 /// Deletes a job that came to its end, when its time is over.
-async fn expire(job: &RenderJobObject, jobs: &Api<RenderJobObject>) -> Result<Action, Error> {
+async fn expire(job: &RenderJobObject, jobs: &Api<Seen>) -> Result<Action, Error> {
     match status::stays(job, Timestamp::now()) {
         None => return Ok(Action::await_change()),
         Some(left) if !left.is_zero() => return Ok(Action::requeue(left)),
@@ -241,7 +241,7 @@ async fn unreadable(invalid: &InvalidObject, context: &Arc<Context>) -> Result<A
     let mut job = RenderJobObject::new("", RenderJobSpec::default());
     job.metadata = invalid.metadata.clone();
     let (namespace, uid) = (job.namespace().unwrap_or_default(), job.metadata.uid.clone().unwrap_or_default());
-    let jobs: Api<RenderJobObject> = Api::namespaced(context.client.clone(), &namespace);
+    let jobs: Api<Seen> = Api::namespaced(context.client.clone(), &namespace);
     if job.metadata.deletion_timestamp.is_some() {
         // of its spec only the storage matters now
         let kind = ApiResource::erase::<RenderJobObject>(&());
@@ -266,10 +266,10 @@ async fn unreadable(invalid: &InvalidObject, context: &Arc<Context>) -> Result<A
 async fn start(
     job: &Arc<RenderJobObject>,
     context: &Arc<Context>,
-    jobs: &Api<RenderJobObject>,
     namespace: &str,
     uid: &str,
 ) -> Result<Arc<Running>, Error> {
+    let jobs: Api<RenderJobObject> = Api::namespaced(context.client.clone(), namespace);
     let (storage, depot) = depot(context, job, namespace).await?;
     let finalizers = job.metadata.finalizers.clone().unwrap_or_default();
     let job = if !finalizers.iter().any(|f| f == FINALIZER) {
@@ -367,7 +367,7 @@ async fn remove_pods(job: &RenderJobObject, context: &Context, namespace: &str, 
 async fn tell(
     job: &RenderJobObject,
     context: &Context,
-    jobs: &Api<RenderJobObject>,
+    jobs: &Api<Seen>,
     status: RenderJobStatus,
 ) -> Result<(), Error> {
     let known = job.status.clone().map(|s| RenderJobStatus { ledger: Vec::new(), ..s });
@@ -403,12 +403,7 @@ async fn tell(
 }
 
 /// The job is being deleted: its thread ends, its objects go, the finalizer last.
-async fn delete(
-    job: &RenderJobObject,
-    context: &Context,
-    jobs: &Api<RenderJobObject>,
-    uid: &str,
-) -> Result<Action, Error> {
+async fn delete(job: &RenderJobObject, context: &Context, jobs: &Api<Seen>, uid: &str) -> Result<Action, Error> {
     let finalizers = job.metadata.finalizers.clone().unwrap_or_default();
     if !finalizers.iter().any(|f| f == FINALIZER) {
         context.jobs.remove(uid);
