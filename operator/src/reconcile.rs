@@ -16,6 +16,7 @@ use kube::{Api, Client, Resource, ResourceExt};
 use rayherd_api::resource::{RenderJobObject, RenderJobStatus};
 use rayherd_api::{RenderJobSpec, validate};
 use rayherd_herd::remote::{Storage, Turns};
+use rayherd_herd::store::StoreError;
 use serde_json::json;
 
 use crate::build;
@@ -415,7 +416,14 @@ async fn delete(job: &RenderJobObject, context: &Context, jobs: &Api<Seen>, uid:
     let namespace = job.namespace().unwrap_or_default();
     context.metrics.forget(&namespace, &job.name_any());
     match depot(context, job, &namespace).await {
-        Ok((_, depot)) => finish::clean(&depot, uid).await.map_err(|e| Error::Clean(e.to_string()))?,
+        Ok((_, depot)) => match finish::clean(&depot, uid).await {
+            Ok(()) => {}
+            // keys that may not read or delete have written nothing, as a rule; the job must not stay for that either
+            Err(e @ StoreError::Denied { .. }) => {
+                tracing::warn!(job = %job.name_any(), "objects of the deleted job may be left in its storage: {e}");
+            }
+            Err(e) => return Err(Error::Clean(e.to_string())),
+        },
         // without its storage nothing can be deleted there, ever: the job must not stay for that
         Err(Error::Storage(e @ StorageError::Missing(_))) => {
             tracing::warn!(job = %job.name_any(), "objects of the deleted job may be left in its storage: {e}");
