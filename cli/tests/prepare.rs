@@ -66,7 +66,7 @@ fn bad_input_is_a_mistake_that_says_what_to_do() {
     assert_mistake(&prepare("nan.obj", &[]), &["nan.obj"]);
     assert_mistake(&prepare("folder", &[]), &["folder"]);
     assert_mistake(&prepare("flat.obj", &[]), &["flat.obj", "lights aside", "of 5 records, 1 have no area"]);
-    assert_mistake(&prepare("cut.ply.gz", &[]), &["cut.ply.gz", "gzip data is cut off", "get the file again"]);
+    assert_mistake(&prepare("cut.ply.gz", &[]), &["cut.ply.gz", "cut off", "deflate", "get the file again"]);
     assert_mistake(&prepare("even.nrrd", &["--iso", "5"]), &["even.nrrd", "lights aside", "iso value"]);
     assert_mistake(&prepare("empty.xml", &["--splits", "0"]), &["--splits is 0: give 1 to 1000000"]);
     assert_mistake(&prepare("empty.xml", &["--block-size", "64K"]), &["--block-size", "ambiguous"]);
