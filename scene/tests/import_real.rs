@@ -62,15 +62,15 @@ fn veach_mis() {
 // 262,661 triangles in OBJ files, and a rectangle
 #[test]
 fn staircase() {
-    scene("scene-staircase", true, (262_663, 0));
+    scene("scene-staircase", false, (262_663, 0));
 }
 
 #[test]
 fn living_room() {
-    scene("scene-living-room", true, (143_163, 0));
+    scene("scene-living-room", false, (143_163, 0));
 }
 
-// 269,536 triangles in OBJ files, and a rectangle
+// 269,536 triangles in OBJ files, and a rectangle; its picture of the sky is missing
 #[test]
 fn dining_room() {
     scene("scene-dining-room", true, (269_538, 0));

@@ -68,6 +68,12 @@ impl Converter<'_> {
         let Some((name, at)) = self.string(id, "filename")? else {
             return malformed(&object.place, "an envmap without a filename");
         };
+        if !self.document.exists(name, at) {
+            let what = format!("envmap file \"{name}\" (there is no such file)");
+            self.unsupported(at, what, "a constant sky of radiance 1");
+            object.properties.iter().for_each(|p| p.used.set(true));
+            return Ok(Environment::Constant([1.0; 3]));
+        }
         let path = self.document.resolve(name, at)?;
         let scale = self.float(id, "scale")?.unwrap_or(1.0);
         if !(scale > 0.0 && scale <= f64::from(f32::MAX)) {

@@ -50,7 +50,7 @@ fn a_bad_envmap_is_refused_with_its_place() {
     assert!(envmap(&format!("{file}{sheared}")).contains("should be a rotation"));
     let two = format!("<emitter type=\"envmap\">{file}</emitter><emitter type=\"constant\"/>");
     assert!(whole(&two).contains("a second environment emitter"));
-    assert!(envmap(&file.replace("sky", "none")).contains("does not exist"));
+    assert!(envmap(&file.replace("sky", "none")).contains("there is no such file"));
     // the picture itself is read when the scene is prepared or checked
     let text = format!("<scene version=\"3.0.0\">{CUBE}\n<emitter type=\"envmap\">{file}</emitter></scene>");
     let path = write(&dir, "s.xml", text);
