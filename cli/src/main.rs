@@ -7,13 +7,13 @@ mod frames;
 mod image_options;
 mod interrupt;
 mod job_file;
+mod kept;
 mod log;
 mod options;
 mod output;
 mod progress;
 mod run_options;
 mod source;
-mod spilling;
 mod store;
 
 use std::process::ExitCode;

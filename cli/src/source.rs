@@ -12,8 +12,8 @@ use rayherd_scene::prepare::{PrepareProgress, Prepared, SpoolSettings, Stage, pr
 
 use crate::log::bars;
 
-/// Imports and prepares the scene of a job that was checked.
-pub fn open(spec: &RenderJobSpec, objects: &dyn ObjectStore) -> anyhow::Result<Prepared> {
+/// Imports and prepares the scene of a job that was checked; also how many bytes of vertices went to temporary files.
+pub fn open(spec: &RenderJobSpec, objects: &dyn ObjectStore) -> anyhow::Result<(Prepared, u64)> {
     let description = import(Path::new(&spec.scene.source), &import_options(spec))?;
     for s in &description.substitutions {
         tracing::warn!("{}: {} is not supported; in its place: {}", s.place, s.what, s.stand_in);
@@ -23,7 +23,8 @@ pub fn open(spec: &RenderJobSpec, objects: &dyn ObjectStore) -> anyhow::Result<P
     let prepared =
         prepare(&description, &source, &prepare_settings(spec), &SpoolSettings::default(), objects, &progress);
     progress.finish();
-    prepared.with_context(|| format!("cannot prepare {}", spec.scene.source))
+    let prepared = prepared.with_context(|| format!("cannot prepare {}", spec.scene.source))?;
+    Ok((prepared, source.spilled_bytes()))
 }
 
 /// Shows the stages of preparing on a terminal.

@@ -1,6 +1,7 @@
 //! Stores by address: a folder, or `s3://bucket/prefix`.
 //!
-//! A store holds prepared scenes (`objects/`, `names/`) and, per image, the commits of its job (`jobs/IMAGE/`).
+//! A store holds prepared scenes (`objects/`, `names/`) and, per picture, the commits of its job (`jobs/PICTURE/`) with a note of what
+//! it is.
 
 use std::path::Path;
 use std::sync::Arc;
@@ -8,14 +9,15 @@ use std::sync::Arc;
 use anyhow::Context;
 use clap::Args;
 use rayherd_herd::store::{
-    BlockStore, DirectoryStore, Prefixed, RetryPolicy, Retrying, S3Settings, S3Store, SceneObjects, StoreError,
+    BlockStore, DirectoryStore, Prefixed, RetryPolicy, Retrying, S3Settings, S3Store, SceneObjects, Spilling,
+    StoreError,
 };
-use rayherd_render::frame::Frame;
-use rayherd_scene::objects::{DirectoryObjects, ObjectHash, ObjectStore};
-use rayherd_scene::prepare::Prepared;
+use rayherd_scene::objects::{DirectoryObjects, ObjectStore};
 use tokio::runtime::Runtime;
 
 use crate::fault::Mistake;
+use crate::interrupt;
+use crate::kept::prefix;
 
 /// Where all jobs are.
 pub const JOBS: &str = "jobs/";
@@ -74,13 +76,9 @@ impl Store {
         Store::open(address, s3)
     }
 
-    /// The part of the store that belongs to one image of a prepared scene.
-    ///
-    /// Ray groups that wait name splits, so another cut of the same scene has a place of its own.
-    pub fn job(&self, prepared: &Prepared, frame: &Frame) -> anyhow::Result<Arc<dyn BlockStore>> {
-        let image = serde_json::to_vec(&(prepared.reference.hash, frame)).context("cannot write the frame down")?;
-        let name = ObjectHash::of(&image).to_string();
-        self.part(&format!("{JOBS}{}", &name[..16]))
+    /// The part of the store that belongs to one picture ([`crate::kept::prefix`]), however its scene is cut.
+    pub fn job(&self, image: &str) -> anyhow::Result<Arc<dyn BlockStore>> {
+        self.part(&prefix(image))
     }
 
     /// What is below a prefix without slash at its end.
@@ -91,5 +89,30 @@ impl Store {
     /// Waits for an operation.
     pub fn wait<T>(&self, operation: impl Future<Output = T>) -> T {
         self.runtime.block_on(operation)
+    }
+}
+
+/// Where a run without a store keeps its prepared scene: in memory while it is small, then in a temporary folder.
+pub struct Temporary {
+    /// Prepared scenes in it.
+    pub objects: Arc<dyn ObjectStore>,
+    spilling: Arc<Spilling>,
+    // its thread does what `objects` asks for
+    _runtime: Runtime,
+}
+
+impl Temporary {
+    /// Up to so many bytes stay in memory.
+    pub fn new(in_memory: u64) -> anyhow::Result<Self> {
+        let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(1).enable_all().build();
+        let runtime = runtime.context("cannot start a thread for input and output")?;
+        let spilling = Arc::new(Spilling::new(in_memory, interrupt::remove_at_end));
+        let objects = Arc::new(SceneObjects::new(spilling.clone(), runtime.handle().clone())?);
+        Ok(Temporary { objects, spilling, _runtime: runtime })
+    }
+
+    /// Bytes that went to the folder.
+    pub fn spilled(&self) -> u64 {
+        self.spilling.spilled()
     }
 }

@@ -60,8 +60,11 @@ fn more_samples_continue_and_equal_the_longer_run() {
     fs::create_dir_all(folder.join("s/objects/00")).unwrap();
     let stray = folder.join("s/objects/00").join("0".repeat(64));
     fs::write(&stray, "stray").unwrap();
+    // and what a writer that was killed left
+    let half = folder.join("s/objects/00/.writing-a");
+    fs::write(&half, "half").unwrap();
     assert_eq!(rayherd(folder, &["gc", "s"]).code, 0);
-    assert!(!stray.exists());
+    assert!(!stray.exists() && !half.exists());
     let last = rayherd(folder, &["gc", "s"]);
     assert!(last.out.contains(": 0 objects deleted, 0 B; "), "{}", last.out);
 
@@ -69,6 +72,97 @@ fn more_samples_continue_and_equal_the_longer_run() {
     assert_mistake(&rayherd(folder, &["gc", "none"]), &["there is no store none"]);
     assert_mistake(&render(folder, "4", "a.exr", &["--store", "a.png/s"]), &["a.png"]);
     assert_mistake(&render(folder, "4", "a.exr", &["--store", "s3://x"]), &["s3://x"]);
+}
+
+#[test]
+fn what_was_begun_otherwise_is_not_begun_anew_without_a_word() {
+    let folder = tempfile::tempdir().unwrap();
+    let folder = folder.path();
+    let scene = fs::read_to_string(scene()).unwrap();
+    fs::write(folder.join("box.xml"), &scene).unwrap();
+    let run = |spp: &str, more: &[&str]| rayherd(folder, &arguments("box.xml", spp, "a.exr", more));
+    let kept = ["--store", "s", "--resume"];
+    // there is nothing yet: it begins
+    assert_eq!(run("2", &kept).code, 0);
+    // another cut of the same scene goes on with it
+    let strategy = run("3", &[&kept[..], &["--strategy", "scheduling-grid", "--report", "r.json"]].concat());
+    assert_eq!(strategy.code, 0, "{}", strategy.err);
+    let report: Value = serde_json::from_slice(&bytes(folder, "r.json")).unwrap();
+    assert!(report["tasks_reused"].as_u64() > Some(0), "{report}");
+
+    let seed = run("3", &[&kept[..], &["--seed", "5"]].concat());
+    assert_mistake(&seed, &["no job of this picture", "box.xml", "seed (0, not 5)", "--store"]);
+    let changed = scene.replacen("0.885809", "0.5", 1);
+    assert_ne!(changed, scene);
+    fs::write(folder.join("box.xml"), changed).unwrap();
+    assert_mistake(&run("3", &kept), &["content", "--resume", "--store"]);
+    // that is how
+    assert_eq!(run("3", &["--store", "s"]).code, 0);
+    assert_eq!(run("4", &kept).code, 0);
+}
+
+/// Files below a folder, by path.
+fn files(folder: &Path) -> Vec<std::path::PathBuf> {
+    let entries = fs::read_dir(folder).unwrap().map(|e| e.unwrap().path());
+    entries.flat_map(|p| if p.is_dir() { files(&p) } else { vec![p] }).collect()
+}
+
+#[test]
+fn a_corrupt_object_of_the_scene_is_named_or_made_again_and_never_rendered() {
+    let folder = tempfile::tempdir().unwrap();
+    let folder = folder.path();
+    assert_eq!(render(folder, "1", "a.exr", &["--store", "s"]).code, 0);
+    let (mut named, mut rebuilt) = (0, 0);
+    for (number, path) in files(&folder.join("s/objects")).into_iter().enumerate() {
+        let whole = fs::read(&path).unwrap();
+        let cut = number % 3 == 2;
+        let mut broken = whole.clone();
+        if cut {
+            broken.truncate(whole.len() / 2);
+        } else {
+            broken[whole.len() / 2] ^= 4;
+        }
+        fs::write(&path, &broken).unwrap();
+        // another seed each time: nothing of the picture is there yet
+        let seed = (1 + number).to_string();
+        assert_eq!(render(folder, "1", "fresh.exr", &["--seed", &seed]).code, 0);
+        let _ = fs::remove_file(folder.join("kept.exr"));
+        let mut made = render(folder, "1", "kept.exr", &["--store", "s", "--seed", &seed]);
+        if made.code != 0 {
+            let hash = path.file_name().unwrap().to_str().unwrap();
+            assert_mistake(&made, &[hash, "corrupt", "delete it"]);
+            assert!(!folder.join("kept.exr").exists());
+            named += 1;
+            // what the message says helps
+            fs::remove_file(&path).unwrap();
+            made = render(folder, "1", "kept.exr", &["--store", "s", "--seed", &seed]);
+        } else {
+            rebuilt += 1;
+        }
+        assert_eq!(made.code, 0, "{}: {}", path.display(), made.err);
+        assert!(bytes(folder, "kept.exr") == bytes(folder, "fresh.exr"), "{}", path.display());
+        assert!(fs::read(&path).unwrap() == whole, "{}", path.display());
+    }
+    assert!(named > 0 && rebuilt > 0, "{named} named, {rebuilt} made again");
+}
+
+#[test]
+fn another_size_of_a_prepared_scene_is_not_prepared_again() {
+    let folder = tempfile::tempdir().unwrap();
+    let folder = folder.path();
+    let scene = scene();
+    let run = |size: &str, output: &str, more: &[&str]| {
+        let run = ["render", &scene, "--size", size, "--spp", "2", "-o", output];
+        let run = rayherd(folder, &[&run[..], more].concat());
+        assert_eq!(run.code, 0, "{}", run.err);
+    };
+    for size in ["24x16", "16x24"] {
+        run(size, "kept.exr", &["--store", "s", "--report", "r.json"]);
+        run(size, "fresh.exr", &[]);
+        assert!(bytes(folder, "kept.exr") == bytes(folder, "fresh.exr"), "{size}");
+        let report: Value = serde_json::from_slice(&bytes(folder, "r.json")).unwrap();
+        assert_eq!(report["prepare"]["reused"], size != "24x16", "{report}");
+    }
 }
 
 /// Waits until the store holds some commits of the child, which must still run then.

@@ -13,8 +13,10 @@ use crate::report::RayCounts;
 use crate::wave::{CameraUnit, Done};
 
 mod chain;
+mod check;
 
-pub use chain::{Chain, ChainError, Fork, newest};
+pub use chain::{Chain, ChainError, Fork, newest, record_key};
+pub use check::{Scope, is_of_cut};
 
 /// Whom a ray group waits for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
@@ -125,10 +127,16 @@ pub enum Refused {
     #[error("task {} does not run", .0.0)]
     NotRunning(TaskId),
     /// A record that does not follow from the state.
-    #[error("record {sequence} does not follow: {message}")]
+    #[error(
+        "{} does not follow from what was committed before: {message}; delete it and what comes after it to go on from there, or \
+         use another store",
+        record_key(*.sequence, .name)
+    )]
     BadRecord {
         /// Its place.
         sequence: u64,
+        /// Its name.
+        name: String,
         /// What does not fit.
         message: String,
     },
@@ -179,6 +187,10 @@ impl Ledger {
         }
     }
 
+    /// Names what defines the image.
+    pub fn image(&self) -> &str {
+        &self.image
+    }
     /// Groups that wait and that no task has taken, by key.
     pub fn waiting(&self) -> impl Iterator<Item = &GroupRef> {
         self.waiting.values()
@@ -210,6 +222,17 @@ impl Ledger {
     /// Attempts that were started and did not count.
     pub fn attempts_lost(&self) -> u64 {
         self.attempts_lost
+    }
+    /// Whether a snapshot is of the state as it is now, wherever its objects lie.
+    pub fn is_as(&self, s: &Snapshot) -> bool {
+        let waiting =
+            s.waiting.len() == self.waiting.len() && s.waiting.iter().all(|g| self.waiting.contains_key(&g.key));
+        let counts = (s.commits, s.rays, s.non_finite) == (self.commits, self.rays, self.non_finite);
+        waiting && counts && s.done == self.done
+    }
+    /// Place of the next record.
+    pub fn sequence(&self) -> u64 {
+        self.sequence
     }
     /// Whether every ray of the samples made so far has come to its end.
     pub fn is_quiet(&self) -> bool {
@@ -295,7 +318,7 @@ impl Ledger {
     /// Gives up all running tasks and takes the state of a snapshot, whose record is durable.
     pub fn go_back(&mut self, record: &Record, name: String) -> Result<(), Refused> {
         if record.parent != self.head || record.sequence != self.sequence {
-            return Err(bad(record, "its parent is not the newest record"));
+            return Err(bad(record, &name, "its parent is not the newest record"));
         }
         let given_up: usize = self.running.values().map(|t| t.live.len()).sum();
         self.attempts_lost += given_up as u64;
@@ -324,7 +347,7 @@ impl Ledger {
     pub fn commit(&mut self, id: TaskId, record: &Record, name: String) -> Result<(), Refused> {
         let task = self.running.get(&id).ok_or(Refused::NotRunning(id))?;
         if record.parent != self.head || record.sequence != self.sequence {
-            return Err(bad(record, "its parent is not the newest record"));
+            return Err(bad(record, &name, "its parent is not the newest record"));
         }
         self.attempts_lost += task.live.len() as u64 - 1;
         let task = self.running.remove(&id).expect("it was found above");
@@ -338,7 +361,7 @@ impl Ledger {
     /// Appends a record that holds the state as it is; running tasks go on.
     pub fn follow_snapshot(&mut self, record: &Record, name: String) -> Result<(), Refused> {
         if record.parent != self.head || record.sequence != self.sequence {
-            return Err(bad(record, "its parent is not the newest record"));
+            return Err(bad(record, &name, "its parent is not the newest record"));
         }
         (self.head, self.sequence) = (name, record.sequence + 1);
         Ok(())
@@ -347,7 +370,7 @@ impl Ledger {
     /// Applies the next record of a chain that is replayed. No task may run.
     pub fn replay(&mut self, record: &Record, name: String) -> Result<(), Refused> {
         if record.image != self.image {
-            return Err(bad(record, "it is of another image"));
+            return Err(bad(record, &name, "it is of another image"));
         }
         if let Some(s) = &record.snapshot {
             // a snapshot stands for all records up to its own
@@ -359,14 +382,14 @@ impl Ledger {
             return Ok(());
         }
         if record.parent != self.head || record.sequence != self.sequence {
-            return Err(bad(record, "its parent is not the record before"));
+            return Err(bad(record, &name, "its parent is not the record before"));
         }
         if let Some(key) = record.took.groups.iter().find(|k| !self.waiting.contains_key(*k)) {
-            return Err(bad(record, &format!("it consumes {key}, which does not wait")));
+            return Err(bad(record, &name, &format!("it consumes {key}, which does not wait")));
         }
         for &unit in &record.took.camera {
             if !self.done.add(unit) || !self.taken.add(unit) {
-                return Err(bad(record, "it makes camera rays a second time"));
+                return Err(bad(record, &name, "it makes camera rays a second time"));
             }
         }
         record.took.groups.iter().for_each(|k| {
@@ -386,8 +409,8 @@ impl Ledger {
     }
 }
 
-fn bad(record: &Record, message: &str) -> Refused {
-    Refused::BadRecord { sequence: record.sequence, message: message.to_owned() }
+fn bad(record: &Record, name: &str, message: &str) -> Refused {
+    Refused::BadRecord { sequence: record.sequence, name: name.to_owned(), message: message.to_owned() }
 }
 
 #[cfg(test)]

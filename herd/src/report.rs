@@ -140,6 +140,15 @@ pub struct NodeReport {
     pub peak_texture_bytes: u64,
 }
 
+/// One sample of a pixel: what `rayherd replay` takes.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct SampleKey {
+    /// Column and row from the upper left corner, from 0.
+    pub pixel: [u32; 2],
+    /// Index of the sample, from 0.
+    pub sample: u32,
+}
+
 /// Everything a run says about itself.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Report {
@@ -187,8 +196,13 @@ pub struct Report {
     pub bytes_per_hop: Option<f64>,
     /// Most memory that the process held (resident).
     pub peak_memory_bytes: u64,
-    /// Contributions that were not finite or too large; each is named in the log.
+    /// Bytes written to temporary files because memory's share for them was full: vertex arrays while importing, the prepared
+    /// scene, rays and film at rest.
+    pub spilled_bytes: u64,
+    /// Contributions that were not finite or too large.
     pub non_finite: u64,
+    /// The samples of the first of them, by pixel: as many as a film keeps. Empty on a cluster, whose operator reads no film.
+    pub non_finite_at: Vec<SampleKey>,
     /// Estimated error of the image, from its halves; none with one sample per pixel.
     pub rel_mse: Option<f64>,
     /// Whether the target error was reached, if one was asked for.

@@ -57,6 +57,18 @@ impl Done {
     pub fn tiles(&self) -> u32 {
         self.0.len() as u32
     }
+    /// Whether it is as [`Done::add`] would have made it, of samples below `end`: what was read may be anything.
+    pub fn is_sound(&self, end: u32) -> bool {
+        let of_tile = |ranges: &Vec<(u32, u32)>| {
+            let apart = ranges.windows(2).all(|w| w[0].1 < w[1].0);
+            apart && ranges.iter().all(|r| r.0 < r.1 && r.1 <= end)
+        };
+        self.0.iter().all(of_tile)
+    }
+    /// How many samples of a tile are done.
+    pub fn samples(&self, tile: u32) -> u32 {
+        self.0[tile as usize].iter().map(|r| r.1 - r.0).sum()
+    }
     /// Adds a unit; false (and nothing changes) if a sample of it is done already, or the tile does not exist.
     pub fn add(&mut self, unit: CameraUnit) -> bool {
         let Some(ranges) = self.0.get_mut(unit.tile as usize) else { return false };

@@ -124,7 +124,7 @@ fn owners(cells: &[CellData]) -> String {
 }
 
 /// Bytes for people, in binary units.
-fn size(bytes: u64) -> String {
+pub fn size(bytes: u64) -> String {
     let units = ["KiB", "MiB", "GiB", "TiB"];
     if bytes < 1024 {
         return format!("{bytes} B");

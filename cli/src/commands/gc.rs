@@ -9,13 +9,13 @@ use clap::Args;
 use rayherd_herd::local::{Collected, collect};
 use rayherd_herd::store::object_key;
 use rayherd_scene::manifest::Manifest;
-use rayherd_scene::objects::ObjectHash;
+use rayherd_scene::objects::{DirectoryObjects, ObjectHash};
 
 use super::{print, size};
 use crate::fault::Mistake;
 use crate::store::{JOBS, S3Options, Store};
 
-/// Delete what nothing in a store names: losing attempts, consumed rays, objects of no scene
+/// Delete what nothing in a store names: losing attempts, consumed rays, objects of no scene, half-written files
 ///
 /// A job that is being written is refused. Do not prepare a scene into the store at the same time: its objects have no
 /// name until it is complete.
@@ -63,6 +63,11 @@ pub fn run(arguments: &Arguments) -> anyhow::Result<ExitCode> {
         }
     }
     store.wait(store.blocks.delete(&garbage))?;
+    if !place.starts_with("s3://") {
+        let (files, bytes) = DirectoryObjects::open(place)?.remove_unfinished()?;
+        total.objects += files;
+        total.bytes += bytes;
+    }
     let Collected { objects, bytes, kept } = total;
     print(&format!("{}: {objects} objects deleted, {}; {kept} kept\n", arguments.store, size(bytes)))?;
     Ok(ExitCode::SUCCESS)

@@ -3,7 +3,6 @@
 use std::num::NonZeroU32;
 use std::path::PathBuf;
 use std::process::ExitCode;
-use std::sync::Arc;
 
 use anyhow::Context;
 use clap::Args;
@@ -13,7 +12,6 @@ use rayherd_herd::job::{Commits, JobSettings, PreparedScene, Sampling};
 use rayherd_herd::local::{JobOutcome, render_local};
 use rayherd_herd::picture;
 use rayherd_herd::report::{Kind, Op, Report};
-use rayherd_scene::objects::ObjectStore;
 use rayherd_scene::prepare::{ByteKind, ByteOp, ByteRow, Prepared};
 use serde_json::json;
 
@@ -22,13 +20,13 @@ use crate::frames::{self, Shot};
 use crate::image_options::ImageOptions;
 use crate::interrupt::{self, Heeding};
 use crate::job_file::read_job;
+use crate::kept::{self, About};
 use crate::options::{self, CutOptions, SceneOptions, set};
 use crate::output::{png_file, replace};
 use crate::progress::{Display, si};
 use crate::run_options::RunOptions;
 use crate::source;
-use crate::spilling::SpillingObjects;
-use crate::store::{S3Options, Store};
+use crate::store::{S3Options, Store, Temporary};
 
 /// Objects of the prepared scene that stay in memory; what is more goes to a temporary folder.
 pub const OBJECTS_IN_MEMORY: u64 = 256 << 20;
@@ -123,11 +121,10 @@ pub fn run(arguments: &Arguments) -> anyhow::Result<ExitCode> {
 
     let keep = &arguments.keep;
     let store = keep.store.as_ref().map(|address| Store::open(address, &keep.s3)).transpose()?;
-    let objects: Arc<dyn ObjectStore> = match &store {
-        Some(store) => store.objects.clone(),
-        None => Arc::new(SpillingObjects::new(OBJECTS_IN_MEMORY)),
-    };
-    let prepared = source::open(&job.spec, objects.as_ref())?;
+    let temporary = if store.is_none() { Some(Temporary::new(OBJECTS_IN_MEMORY)?) } else { None };
+    let objects = store.as_ref().map(|s| s.objects.clone()).or_else(|| temporary.as_ref().map(|t| t.objects.clone()));
+    let objects = objects.context("no place for the prepared scene")?;
+    let (prepared, vertices_spilled) = source::open(&job.spec, objects.as_ref())?;
     let shots = frames::shots(&job, &prepared.manifest)?;
     let scene = PreparedScene::open(prepared.manifest.clone(), objects)?;
     let sampling = Sampling {
@@ -136,14 +133,25 @@ pub fn run(arguments: &Arguments) -> anyhow::Result<ExitCode> {
         time_limit: job.spec.sampling.time_limit,
     };
     let exposure = job.spec.image.exposure.unwrap_or(0.0);
+    let named = |shot: &Shot| -> anyhow::Result<(String, About)> {
+        Ok((scene.image_name(&shot.frame)?, About::new(&job.spec.scene.source, &scene, &shot.frame)?))
+    };
+    let names = shots.iter().map(named).collect::<Result<Vec<_>, _>>()?;
+    if let (true, Some(store), Some(place)) = (keep.resume, &store, &keep.store) {
+        kept::check_resumed(store, place, &names)?;
+    }
     let mut reports = Vec::new();
-    for shot in &shots {
+    for (shot, (image, about)) in shots.iter().zip(&names) {
         let preview = arguments.preview.clone().unwrap_or_else(|| shot.png());
-        let store = store.as_ref().map(|store| store.job(&prepared, &shot.frame)).transpose()?;
+        if let Some(store) = &store {
+            kept::note(store, image, about)?;
+        }
+        let store = store.as_ref().map(|store| store.job(image)).transpose()?;
         let commits = store.map(|store| Commits { store, resume: keep.resume, takeover: keep.takeover });
         let settings = JobSettings { commits, ..settings.clone() };
         let mut outcome = render(&scene, shot, &sampling, &settings, (preview, exposure))?;
         outcome.report.prepare = prepare_report(&prepared);
+        outcome.report.spilled_bytes += vertices_spilled + temporary.as_ref().map_or(0, Temporary::spilled);
         outcome.report.add_prepare_bytes(prepared.report.bytes.iter().map(prepare_row));
         let saved = save(&scene, shot, &outcome, exposure);
         match &keep.store {

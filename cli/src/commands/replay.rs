@@ -2,7 +2,6 @@
 
 use std::fmt::Write;
 use std::process::ExitCode;
-use std::sync::Arc;
 
 use clap::Args;
 use rayherd_api::{RenderJob, RenderJobSpec};
@@ -13,7 +12,6 @@ use rayherd_render::bvh::{Kernel, Tracer};
 use rayherd_render::film::FilmPart;
 use rayherd_render::path::{Outcome, PathRay, ShadowRay, Surfaces, camera_ray, shade};
 use rayherd_render::ray::Hit;
-use rayherd_scene::objects::ObjectStore;
 
 use super::print;
 use super::render::OBJECTS_IN_MEMORY;
@@ -22,7 +20,7 @@ use crate::frames;
 use crate::image_options::ImageOptions;
 use crate::options::{self, SceneOptions, numbers};
 use crate::source;
-use crate::spilling::SpillingObjects;
+use crate::store::Temporary;
 
 /// Trace one sample of one pixel again and print every vertex of its path
 ///
@@ -52,8 +50,9 @@ pub fn run(arguments: &Arguments) -> anyhow::Result<ExitCode> {
     arguments.image.apply(&mut spec);
     let job = RenderJob::new(spec);
     options::check(&job, None)?;
-    let objects: Arc<dyn ObjectStore> = Arc::new(SpillingObjects::new(OBJECTS_IN_MEMORY));
-    let prepared = source::open(&job.spec, objects.as_ref())?;
+    let temporary = Temporary::new(OBJECTS_IN_MEMORY)?;
+    let objects = temporary.objects.clone();
+    let (prepared, _) = source::open(&job.spec, objects.as_ref())?;
     let frame = frames::frame(&job, &prepared.manifest, job.spec.image.cameras.first())?;
     let ([x, y], [width, height]) = (arguments.pixel, frame.size);
     if x >= width || y >= height {

@@ -57,6 +57,10 @@ impl<F: FilmSum> Driver<'_, '_, F> {
         let late = settings.straggler_seconds.unwrap_or((3.0 * settings.task_seconds).max(1.0));
         let slow = self.running.iter().filter(|(_, r)| r.attempts < 2 && r.started.elapsed().as_secs_f64() > late);
         let slow: Vec<TaskId> = slow.map(|(&t, _)| t).collect();
+        if slow.is_empty() {
+            return;
+        }
+        let holders = executor.holders().unwrap_or_else(|| self.shared.nodes.holders());
         for task in slow {
             if !executor.has_room() {
                 return;
@@ -73,8 +77,10 @@ impl<F: FilmSum> Driver<'_, '_, F> {
             let rests = |n: u32| self.free[n as usize] == settings.nodes[n as usize].slots;
             let may = |n: u32| self.free[n as usize] > 0 && executor.is_up(n) && (holds(n) || rests(n));
             let nodes = (0..self.free.len() as u32).filter(|&n| may(n));
-            // on another node, if there is one
-            let best = nodes.max_by_key(|&n| (n != first, holds(n), self.free[n as usize]));
+            // on another node, if there is one, and where the data lies
+            let set: &[u32] = if let Set::Resident(set) = &self.running[&task].spec.set { set } else { &[] };
+            let near = |n: u32| set.iter().filter(|&&s| holders[s as usize].contains(&n)).count();
+            let best = nodes.max_by_key(|&n| (n != first, holds(n), near(n), self.free[n as usize]));
             if let Some((node, held)) = best.map(|n| (n, holds(n)))
                 && self.ledger.again(task).is_ok()
             {

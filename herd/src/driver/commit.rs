@@ -4,7 +4,7 @@ use std::time::{Duration, Instant};
 
 use super::{Driver, FilmSum, Finished, Objects};
 use crate::job::JobError;
-use crate::ledger::{Record, Refused, TaskId};
+use crate::ledger::{Record, Refused, TaskId, record_key};
 use crate::local::attempt::Made;
 use crate::local::journal;
 
@@ -76,8 +76,7 @@ impl<F: FilmSum> Driver<'_, '_, F> {
         self.rate.add(cpu, made_rays.closest + made_rays.shadow, made_rays.camera);
         self.tasks += 1;
         let bytes = record.made.groups.iter().map(|g| g.bytes).sum::<u64>();
-        let windows = self.cut.as_ref().map_or(0, Vec::len).max(1);
-        self.traffic.add(made_rays.camera, made_rays.closest + made_rays.shadow, windows, made.hops, bytes);
+        self.traffic.add(made_rays.camera, made_rays.closest + made_rays.shadow, self.parts, made.hops, bytes);
         self.hops += made.hops;
         self.hop_bytes += bytes;
         if let Some(film) = record.made.film {
@@ -127,9 +126,10 @@ impl<F: FilmSum> Driver<'_, '_, F> {
     /// Makes a record durable, if the job keeps records; its name.
     pub(super) fn write(&mut self, record: &Record) -> Result<String, JobError> {
         let Some(pointer) = &self.pointer else { return Ok(record.sequence.to_string()) };
+        pointer.check()?;
         let name = journal::write(&self.shared.nodes, record)?;
         pointer.move_to(record.sequence, &name)?;
-        self.old_records[1].push(journal::key(record.sequence, &name));
+        self.old_records[1].push(record_key(record.sequence, &name));
         Ok(name)
     }
 

@@ -40,6 +40,8 @@ pub enum Event {
     Finished(Box<Finished>),
     /// A node has lost its memory and its disk, and is there again, empty.
     NodeLost(u32),
+    /// A node has lost what it held in memory.
+    MemoryLost(u32),
 }
 
 /// Where tasks run.
@@ -96,6 +98,13 @@ pub trait FilmSum {
 
 /// Where it is kept which record is the newest: the one place that must be consistent.
 pub trait Pointer: Send + Sync {
+    /// Whether it may be moved, as far as is known: asked before a record is written.
+    ///
+    /// # Errors
+    /// [`JobError::Owned`] when somebody else may have moved it.
+    fn check(&self) -> Result<(), JobError> {
+        Ok(())
+    }
     /// Moves the pointer to a record that is durable.
     ///
     /// # Errors

@@ -12,7 +12,7 @@ impl<F: FilmSum> Driver<'_, '_, F> {
     /// taken back in parts either. What was committed since then is computed again and counted ([`Report::tasks_redone`]).
     ///
     /// [`Report::tasks_redone`]: crate::report::Report::tasks_redone
-    pub(super) fn go_back(&mut self, why: &JobError) -> Result<(), JobError> {
+    pub(crate) fn go_back(&mut self, why: &JobError) -> Result<(), JobError> {
         tracing::warn!("{why}; what was committed since no ray was on its way is computed again");
         let before: Objects = self.ledger.snapshot(None).waiting.into_iter().map(|g| (g.key, g.holders)).collect();
         let mut snapshot = self.settled.clone();

@@ -13,7 +13,6 @@ mod planning;
 mod steps;
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::ops::Range;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
@@ -21,6 +20,7 @@ use crate::job::{JobError, Progress, Sampling};
 use crate::ledger::{Ledger, Snapshot, TaskId};
 use crate::local::attempt::{Attempt, Shared};
 use crate::local::slots::StopFlag;
+use crate::plan::Window;
 use crate::plan::cost::Traffic;
 use crate::plan::rate::Rate;
 use crate::report::RayCounts;
@@ -75,7 +75,9 @@ pub struct Driver<'s, 'a, F> {
     order: Vec<u32>,
     rank: Vec<u32>,
     /// How `auto` cuts the scene, in places along the curve, and what each node holds of it.
-    cut: Option<Vec<Range<u32>>>,
+    cut: Option<Vec<Window>>,
+    /// In how many parts the cut divides the scene.
+    parts: f64,
     windows: Vec<BTreeSet<u32>>,
     traffic: Traffic,
     free: Vec<u32>,
@@ -134,6 +136,7 @@ impl<'s, 'a, F: FilmSum> Driver<'s, 'a, F> {
             order,
             rank,
             cut: None,
+            parts: 1.0,
             windows: vec![BTreeSet::new(); shared.settings.nodes.len()],
             traffic: Traffic::default(),
             free: shared.settings.nodes.iter().map(|n| n.slots).collect(),
@@ -192,6 +195,8 @@ impl<'s, 'a, F: FilmSum> Driver<'s, 'a, F> {
             match executor.next(Duration::from_millis(100))? {
                 Some(Event::Finished(finished)) => self.handle(*finished)?,
                 Some(Event::NodeLost(node)) => self.lose_node(node)?,
+                // what it is planned to hold must be loaded again, by whoever is nearest
+                Some(Event::MemoryLost(node)) => self.windows[node as usize].clear(),
                 None => {}
             }
             self.tell();

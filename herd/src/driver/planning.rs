@@ -62,9 +62,10 @@ impl<F: FilmSum> Driver<'_, '_, F> {
             (a, keys)
         };
         let plan = plan::plan(&view).into_iter().map(with_keys).collect();
-        if cut.is_some() {
+        if let Some(cut) = cut {
+            self.parts = plan::cut::parts(splits.iter().map(|s| s.bytes), &cut);
             self.windows.iter_mut().for_each(BTreeSet::clear);
-            self.cut = cut;
+            self.cut = Some(cut);
         }
         plan
     }
@@ -91,7 +92,11 @@ impl<F: FilmSum> Driver<'_, '_, F> {
         let held = &mut self.windows[node as usize];
         let both: BTreeSet<u32> = held.iter().chain(ranks).copied().collect();
         let bytes: u64 = both.iter().map(|&r| scene.split_bytes(self.order[r as usize])).sum();
-        let beside = bytes <= self.shared.nodes.memory(node).capacity() && !self.cut.as_ref().is_none_or(Vec::is_empty);
+        // windows that overlap would be in memory twice
+        let there = ranks.iter().filter(|r| held.contains(r)).count();
+        let beside = (there == 0 || there == ranks.len())
+            && bytes <= self.shared.nodes.memory(node).capacity()
+            && !self.cut.as_ref().is_none_or(Vec::is_empty);
         *held = if beside { both } else { ranks.iter().copied().collect() };
     }
 }

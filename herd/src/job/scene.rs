@@ -29,6 +29,8 @@ pub struct PreparedScene {
     pub grid: Grid,
     /// Where the objects are.
     pub objects: Arc<dyn ObjectStore>,
+    /// Names how it is cut into splits: rays that wait for a split of one cut mean nothing in another.
+    pub cut: String,
 }
 
 impl PreparedScene {
@@ -74,7 +76,10 @@ impl PreparedScene {
         }
         let lights = Lights::with_sky_map(&world, sky_map);
         let grid = manifest.grid()?;
-        Ok(PreparedScene { manifest, world, lights, grid, objects })
+        let cut =
+            serde_json::to_vec(&(&manifest.splits, &manifest.grid)).map_err(|e| JobError::Internal(e.to_string()))?;
+        let cut = blake3::hash(&cut).to_hex()[..12].to_owned();
+        Ok(PreparedScene { manifest, world, lights, grid, objects, cut })
     }
 
     /// Number of splits.

@@ -4,13 +4,27 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use super::Record;
 
-/// The records to replay, oldest first, with their names.
+/// The key of a record in its job's store: its place first, so that a listing is in order.
+pub fn record_key(sequence: u64, name: &str) -> String {
+    format!("records/{sequence:010}-{name}")
+}
+
+/// The records to replay, oldest first, with their names: as far back as they go without a gap, so that older snapshots can be
+/// begun from when a newer one turns out to name what cannot be read.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Chain {
     /// `(name, record)`; the first one is a snapshot or record 0.
     pub records: Vec<(String, Record)>,
     /// Places where two records name the same parent.
     pub forks: Vec<Fork>,
+}
+
+impl Chain {
+    /// Where replaying can begin, the newest place first: snapshots, and the first record of all.
+    pub fn starts(&self) -> Vec<usize> {
+        let starts = |&i: &usize| i == 0 || self.records[i].1.snapshot.is_some();
+        (0..self.records.len()).rev().filter(starts).collect()
+    }
 }
 
 /// Two or more records with the same parent: two writers were at work.
@@ -90,21 +104,23 @@ pub fn newest(image: &str, records: BTreeMap<String, Record>) -> Result<Chain, C
     Ok(Chain { records, forks })
 }
 
-/// Names from the tip back to a snapshot or to the start; none if one is missing.
+/// Names from the tip back to the oldest snapshot, or to the start, that can be reached; none if there is none.
 fn lead_back(image: &str, records: &BTreeMap<String, Record>, tip: &str) -> Option<Vec<String>> {
     let mut names = Vec::new();
-    let mut name = tip;
-    loop {
-        let record = records.get(name)?;
-        if let Some(last) = names.last().and_then(|n: &String| records.get(n))
-            && record.sequence + 1 != last.sequence
-        {
-            return None;
-        }
+    let mut complete = 0;
+    let mut next = Some(tip);
+    let mut after: Option<u64> = None;
+    while let Some((name, record)) = next.and_then(|name| Some((name, records.get(name)?)))
+        && after.is_none_or(|after| record.sequence.checked_add(1) == Some(after))
+    {
         names.push(name.to_owned());
-        if record.snapshot.is_some() || (record.sequence == 0 && record.parent == image) {
-            return Some(names);
+        after = Some(record.sequence);
+        let first = record.sequence == 0 && record.parent == image;
+        if first || record.snapshot.is_some() {
+            complete = names.len();
         }
-        name = &record.parent;
+        next = (!first).then_some(&record.parent);
     }
+    names.truncate(complete);
+    (complete > 0).then_some(names)
 }

@@ -182,8 +182,13 @@ proptest! {
         for skip in [0, records.len() / 2] {
             let from = records.iter().skip(skip).position(|r| r.1.snapshot.is_some()).map_or(0, |p| p + skip);
             let mut again = Ledger::new("image", 4);
-            for (name, record) in &records[from..] {
-                again.replay(record, name.clone()).unwrap();
+            let scope = Scope { tiles: 4, pixels: None, splits: Some(("cut".into(), 8)) };
+            for (number, (name, record)) in records[from..].iter().enumerate() {
+                if let (Some(snapshot), true) = (&record.snapshot, number > 0) {
+                    prop_assert!(again.is_as(snapshot), "a snapshot is of the state before it");
+                }
+                // what was written by the rules is believed
+                scope.replay(&mut again, record, name.clone()).unwrap();
             }
             prop_assert_eq!(&again.waiting, &ledger.waiting);
             prop_assert_eq!((&again.done, &again.taken, &again.head), (&ledger.done, &ledger.taken, &ledger.head));
@@ -207,4 +212,132 @@ fn going_back_gives_up_what_came_after() {
     assert!(ledger.is_quiet() && !ledger.lost(running, 0));
     assert_eq!((ledger.commits(), ledger.attempts_lost(), ledger.done().complete()), (0, 1, 0));
     assert!(ledger.start(&camera(&[unit(0, 0, 1)])).is_ok(), "its camera rays are free again");
+}
+
+/// A chain of four records: camera rays, their groups, a snapshot, and what consumes one of the groups.
+fn chain() -> (Scope, Vec<(String, Record)>) {
+    let scope = Scope { tiles: 2, pixels: Some(vec![100, 50]), splits: Some(("cut".into(), 8)) };
+    let mut ledger = Ledger::new("image", 2);
+    let mut records = Vec::new();
+    let rays = |camera: u64| RayCounts { camera, closest: 2 * camera + 7, shadow: 3, merged: 0 };
+    let film = |key: &str| FilmRef { key: key.into(), bytes: 10, holders: vec![0, 1] };
+    let group = |key: &str, to| GroupRef { key: key.into(), ..group("", to, 7) };
+    let (id, _) = ledger.start(&camera(&[unit(0, 0, 2), unit(1, 0, 1)])).unwrap();
+    let groups = vec![group("rays/cut-a", 3), group("rays/cut-b", 7)];
+    let made = Outputs { groups, film: Some(film("film/a")), rays: rays(250), non_finite: 1 };
+    records.push(commit(&mut ledger, id, made));
+    let record = ledger.record_of(ledger.snapshot(Some(film("film/s"))));
+    ledger.follow_snapshot(&record, "s".into()).unwrap();
+    records.push(("s".into(), record));
+    let (id, _) = ledger.start(&Inputs { groups: vec!["rays/cut-a".into()], camera: vec![unit(0, 2, 3)] }).unwrap();
+    let made = Outputs { groups: vec![group("rays/cut-c", 0)], film: None, rays: rays(100), non_finite: 0 };
+    records.push(commit(&mut ledger, id, made));
+    (scope, records)
+}
+
+fn follow(scope: &Scope, records: &[(String, Record)]) -> Result<Ledger, Refused> {
+    let mut ledger = Ledger::new("image", scope.tiles);
+    records.iter().try_for_each(|(name, record)| scope.replay(&mut ledger, record, name.clone()))?;
+    Ok(ledger)
+}
+
+#[test]
+fn a_record_that_cannot_be_is_named_and_refused() {
+    let (scope, records) = chain();
+    assert_eq!(follow(&scope, &records).unwrap().commits(), 2);
+    assert_eq!(follow(&scope, &records[1..]).unwrap().commits(), 2);
+    type Wrong = (usize, &'static str, fn(&mut Record));
+    fn snapshot(r: &mut Record) -> &mut Snapshot {
+        r.snapshot.as_mut().expect("the second one is a snapshot")
+    }
+    let wrong: [Wrong; 24] = [
+        (0, "tile 2", |r| r.took.camera[1].tile = 2),
+        (0, "samples 2..2", |r| r.took.camera[0].first = 2),
+        (0, "samples 0..", |r| r.took.camera[0].end = u32::MAX),
+        (0, "a second time", |r| {
+            r.took.camera.push(unit(0, 1, 2));
+            r.made.rays.camera += 100;
+        }),
+        (0, "250 were made", |r| r.made.rays.camera = 249),
+        (0, "camera rays", |r| r.made.rays.closest = 10),
+        (0, "names rays/cut-a twice", |r| r.made.groups[1].key = "rays/cut-a".into()),
+        (0, "waits for split 8 of 8", |r| r.made.groups[1].to = Destination::Split(8)),
+        (0, "0 rays", |r| r.made.groups[0].rays = 0),
+        (0, "0 bytes", |r| r.made.groups[0].bytes = 0),
+        (0, "lies on nodes [2, 2]", |r| r.made.groups[0].holders = vec![2, 2]),
+        (0, "film/a has no bytes", |r| r.made.film.as_mut().expect("film").bytes = 0),
+        (0, "another image", |r| r.image = "other".into()),
+        (1, "film tiles", |r| snapshot(r).done = Done::none(3)),
+        (1, "9 commits", |r| snapshot(r).commits = 9),
+        (1, "250 were made", |r| snapshot(r).rays.camera += 1),
+        (1, "twice", |r| {
+            let again = snapshot(r).waiting[0].clone();
+            snapshot(r).waiting.push(again);
+        }),
+        (1, "no sample was made", |r| {
+            snapshot(r).done = Done::none(2);
+            snapshot(r).rays = RayCounts::default();
+        }),
+        (1, "consumes or makes something", |r| r.took.groups.push("rays/cut-a".into())),
+        (2, "rays/cut-x, which does not wait", |r| r.took.groups[0] = "rays/cut-x".into()),
+        (2, "twice", |r| r.took.groups.push("rays/cut-a".into())),
+        (2, "there already", |r| r.made.groups[0].key = "rays/cut-b".into()),
+        (2, "more rays than", |r| r.made.rays.shadow = u64::MAX),
+        (2, "consumes nothing", |r| r.took = Inputs::default()),
+    ];
+    for (at, says, change) in wrong {
+        let mut records = records.clone();
+        change(&mut records[at].1);
+        let error = follow(&scope, &records).expect_err(says).to_string();
+        assert!(error.contains(says) && error.contains(&record_key(at as u64, &records[at].0)), "{says}: {error}");
+    }
+    // of another cut, the split's number says nothing here
+    let mut other = records;
+    other[0].1.made.groups[1] = GroupRef { key: "rays/old-b".into(), ..group("", 99, 7) };
+    assert!(follow(&scope, &other[..1]).is_ok_and(|l| l.waiting().any(|g| !is_of_cut(g, "cut"))));
+}
+
+proptest! {
+    /// What is sound is what adding its ranges one by one gives.
+    #[test]
+    fn done_is_sound_when_adding_makes_it(ranges in prop::collection::vec((0u32..30, 0u32..30), 0..5), end in 20u32..40) {
+        let read: Done = serde_json::from_value(serde_json::json!([ranges])).unwrap();
+        let mut made = Done::none(1);
+        let all = ranges.iter().all(|&(a, b)| b <= end && made.add(unit(0, a, b)));
+        prop_assert_eq!(read.is_sound(end), all && made == read);
+        if read.is_sound(end) {
+            prop_assert_eq!(read.samples(0), ranges.iter().map(|r| r.1 - r.0).sum::<u32>());
+        }
+    }
+
+    /// From whichever place a chain can be begun, the same state is reached.
+    #[test]
+    fn a_chain_reaches_as_far_back_as_it_can(lost in prop::collection::btree_set(0u64..12, 0..4), snapshots in prop::collection::btree_set(0u64..12, 0..5)) {
+        let state = Ledger::new("image", 1).snapshot(None);
+        let record = |n: u64| Record {
+            image: "image".into(),
+            sequence: n,
+            parent: if n == 0 { "image".into() } else { (n - 1).to_string() },
+            took: Inputs::default(),
+            made: Outputs::default(),
+            snapshot: snapshots.contains(&n).then(|| state.clone()),
+        };
+        let all: BTreeMap<String, Record> =
+            (0..12).filter(|n| !lost.contains(n)).map(|n| (n.to_string(), record(n))).collect();
+        // the plain twin: each tip from the highest down, each beginning from the lowest up
+        let whole = |from: u64, to: u64| (from..=to).all(|n| !lost.contains(&n));
+        let begins = |n: u64| n == 0 || snapshots.contains(&n);
+        let mut spans = (0..12).rev().flat_map(|to| (0..=to).map(move |from| (from, to)));
+        let naive = spans.find(|&(from, to)| begins(from) && whole(from, to));
+        match newest("image", all) {
+            Ok(chain) => {
+                let places: Vec<u64> = chain.records.iter().map(|r| r.1.sequence).collect();
+                let (from, to) = naive.unwrap();
+                prop_assert_eq!(places, (from..=to).collect::<Vec<_>>());
+                let starts: Vec<u64> = chain.starts().into_iter().map(|i| from + i as u64).collect();
+                prop_assert_eq!(starts, (from..=to).rev().filter(|&n| begins(n)).collect::<Vec<_>>());
+            }
+            Err(e) => prop_assert!(naive.is_none() && matches!(e, ChainError::Incomplete { .. }), "{}", e),
+        }
+    }
 }

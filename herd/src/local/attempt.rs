@@ -87,7 +87,7 @@ struct Store<'a> {
 
 impl GroupSink for Store<'_> {
     fn store(&self, to: Destination, number: u32, rays: &Flights) -> Result<GroupRef, JobError> {
-        let key = format!("rays/{}-{number}", self.attempt.name);
+        let key = format!("rays/{}-{}-{number}", self.shared.scene.cut, self.attempt.name);
         let wrong = |source| JobError::Wire { key: key.clone(), source };
         let body = ray_group::encode(self.shared.frame, rays).map_err(wrong)?;
         let bytes = body.len() as u64;
@@ -163,9 +163,23 @@ struct Task<'a, 'f> {
 }
 
 impl Task<'_, '_> {
-    /// Hands the input rays over, some batches at a time, and at last once without any, for the camera rays.
-    fn inputs(&mut self, mut each: impl FnMut(&mut Self, Flights) -> Result<(), JobError>) -> Result<(), JobError> {
-        let least = 4 * self.shared.settings.batch as usize;
+    /// Rays of a few batches: for tasks that hold all that they need, so that no more of them wait in memory than need to.
+    fn few(&self) -> usize {
+        4 * self.shared.settings.batch as usize
+    }
+
+    /// Rays that fill the ray buffer: for tasks that go through several splits, each of which is loaded once for all of these.
+    fn many(&self) -> usize {
+        (self.shared.settings.ray_buffer / size_of::<PathFlight>() as u64).max(1) as usize
+    }
+
+    /// Hands the input rays over, `least` and at most one group more at a time, and at last what is left, maybe none, for the
+    /// camera rays.
+    fn inputs(
+        &mut self,
+        least: usize,
+        mut each: impl FnMut(&mut Self, Flights) -> Result<(), JobError>,
+    ) -> Result<(), JobError> {
         let mut flights = Flights::default();
         for group in &self.attempt.groups {
             let open = |body: &bytes::Bytes| {
@@ -188,7 +202,7 @@ impl Task<'_, '_> {
         let blocks = shared.nodes.blocks(node);
         let surfaces = lease.surfaces(shared.scene, &blocks)?;
         let (context, grid) = (shared.context(self.textures), &shared.scene.grid);
-        self.inputs(|t, mut flights| {
+        self.inputs(self.few(), |t, mut flights| {
             if lease.is_complete() {
                 t.trace.run_complete(&context, &lease, &surfaces, &mut flights, t.camera, t.film, stop)
             } else {
@@ -201,11 +215,11 @@ impl Task<'_, '_> {
     fn any(&mut self) -> Result<(), JobError> {
         let (shared, node, stop) = (self.shared, self.attempt.node, self.stop);
         let (context, grid) = (shared.context(self.textures), &shared.scene.grid);
-        let limit = (shared.settings.ray_buffer / size_of::<PathFlight>() as u64).max(1) as usize;
+        let limit = self.many();
         let mut queues = Queues::default();
         let mut none = CameraFeed::new(shared.frame, Vec::new());
         let mut missed = Outcome::default();
-        self.inputs(|t, flights| {
+        self.inputs(limit, |t, flights| {
             for ray in queues.route(shared, flights)? {
                 miss(&context, ray, &mut missed, t.film);
             }
@@ -241,8 +255,8 @@ impl Task<'_, '_> {
         let (context, grid) = (shared.context(self.textures), &shared.scene.grid);
         let together = grid.sharing(split);
         let set: SplitSet = together.iter().copied().collect();
-        let limit = (shared.settings.ray_buffer / size_of::<PathFlight>() as u64).max(1) as usize;
-        self.inputs(|t, mut flights| {
+        let limit = self.many();
+        self.inputs(limit, |t, mut flights| {
             loop {
                 let room = limit.saturating_sub(flights.paths.len());
                 let mut made: Vec<PathRay> = Vec::new();
@@ -253,7 +267,10 @@ impl Task<'_, '_> {
                     return Ok(());
                 }
                 t.shade_decided(split, &context, &mut flights)?;
-                for &s in &together {
+                // what the node holds comes first: in a fixed order each split would drive out the one that is needed next
+                let warm = shared.nodes.memory(node).warm();
+                let (held, cold): (Vec<u32>, Vec<u32>) = together.iter().partition(|s| warm.contains(s));
+                for &s in held.iter().chain(&cold) {
                     let lease = shared.lease(node, &[s])?;
                     for batch in flights.paths.chunks_mut(shared.settings.batch as usize) {
                         stop.check()?;
@@ -306,7 +323,7 @@ impl Task<'_, '_> {
     fn reduce(&mut self, groups: &mut Groups) -> Result<(), JobError> {
         let (shared, context) = (self.shared, self.shared.context(self.textures));
         let mut missed = Outcome::default();
-        self.inputs(|t, mut flights| {
+        self.inputs(self.few(), |t, mut flights| {
             flights.paths.sort_by_key(|f| (f.ray.key, f.candidate.t.to_bits(), f.candidate.prim));
             flights.paths.dedup_by_key(|f| f.ray.key);
             for flight in flights.paths.drain(..) {

@@ -46,6 +46,15 @@ impl Disks {
         self.folder.path()
     }
 
+    /// Changes a byte of a node's copy of a block, if it has one, for tests.
+    pub async fn corrupt(&self, node: u32, (kind, object): (Kind, &ObjectRef), at: u64) -> Result<(), JobError> {
+        let (disk, key) = (&self.copies.nodes()[node as usize], key(kind, object));
+        match disk.get(&key).await {
+            Ok(body) if !body.is_empty() => Ok(disk.put(&key, damaged(&body, at)).await?),
+            _ => Ok(()),
+        }
+    }
+
     fn placed(&self, object: &ObjectRef) -> &Mutex<BTreeSet<String>> {
         &self.placed[usize::from(object.hash.0[0]) % LOCKS]
     }
@@ -113,6 +122,16 @@ impl Disks {
         }
         Ok(())
     }
+}
+
+/// A body with another byte.
+pub fn damaged(body: &Body, at: u64) -> Body {
+    let mut bytes = body.to_vec();
+    let at = at as usize % bytes.len().max(1);
+    if let Some(byte) = bytes.get_mut(at) {
+        *byte ^= 0x10;
+    }
+    bytes.into()
 }
 
 fn indices(nodes: &[u32]) -> Vec<usize> {

@@ -1,17 +1,19 @@
 //! The chain of round records in a store: written before a commit counts, read to go on.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
 use bytes::Bytes;
 use rayherd_render::film::FilmPart;
+use rayherd_render::frame::Frame;
 
 use super::nodes::Nodes;
 use super::owner::Ownership;
-use crate::job::JobError;
-use crate::ledger::{Chain, ChainError, FilmRef, Ledger, Record, Snapshot, newest};
+use crate::job::{JobError, PreparedScene};
+use crate::ledger::{Chain, ChainError, FilmRef, Ledger, Record, Scope, Snapshot, is_of_cut, newest, record_key};
 use crate::report::{Kind as ByteKind, Op, Place, Stage};
 use crate::store::{BlockStore, StoreError};
+use crate::task::camera::{tile_pixels, tiles};
 use crate::task::codec;
 use crate::wire::envelope::{Compress, Kind, WireError, open, seal};
 
@@ -20,6 +22,9 @@ const RECORDS: &str = "records/";
 const RECORD_LIMIT: usize = 1 << 30;
 /// Largest ray group that is read: its number of rays is bounded by the format.
 const GROUP_LIMIT: usize = 1 << 27;
+
+/// Why rays cannot be taken over though they are there.
+pub const OTHER_CUT: &str = "its rays wait for splits of the scene as it was cut otherwise";
 
 /// What a store held.
 pub struct Resumed {
@@ -35,18 +40,13 @@ pub struct Resumed {
     pub lost: u64,
 }
 
-/// Key of a record: its place first, so that a listing is in order.
-pub fn key(sequence: u64, name: &str) -> String {
-    format!("{RECORDS}{sequence:010}-{name}")
-}
-
 /// Stores a record; its name, the hash of its body.
 pub fn write(nodes: &Nodes, record: &Record) -> Result<String, JobError> {
     let json = serde_json::to_vec(record).map_err(|e| JobError::Internal(e.to_string()))?;
     let body = seal(Kind::RoundRecord, &json, Compress::Lz4);
     let name = blake3::hash(&body).to_hex().to_string();
     nodes.count(Stage::Trace, Op::Write, ByteKind::Film, 0, Place::Local, body.len() as u64);
-    nodes.wait(nodes.store().put(&key(record.sequence, &name), body))?;
+    nodes.wait(nodes.store().put(&record_key(record.sequence, &name), body))?;
     Ok(name)
 }
 
@@ -94,9 +94,16 @@ fn record(key: &str, body: &Bytes) -> Result<(String, Record), WireError> {
     Ok((name, serde_json::from_slice(&json).map_err(|e| WireError::corrupt(e.to_string()))?))
 }
 
-/// The state to go on from.
-pub fn resume(nodes: &Nodes, image: &str, tiles: u32, size: [u32; 2]) -> Result<Resumed, JobError> {
-    let chain = newest(image, nodes.wait(read(nodes.store().as_ref()))?)?;
+/// What the records of a frame may name.
+pub fn scope(scene: &PreparedScene, frame: &Frame) -> Scope {
+    let tiles = tiles(frame);
+    let pixels = (0..tiles).map(|t| u64::from(tile_pixels(frame, t))).collect();
+    Scope { tiles, pixels: Some(pixels), splits: Some((scene.cut.clone(), scene.splits())) }
+}
+
+/// The newest chain of an image's records; what else there is, is told.
+pub fn newest_of(image: &str, records: BTreeMap<String, Record>) -> Result<Chain, JobError> {
+    let chain = newest(image, records)?;
     for fork in &chain.forks {
         tracing::warn!(
             "two writers were at work: record {} has {} children; {} is followed",
@@ -105,35 +112,37 @@ pub fn resume(nodes: &Nodes, image: &str, tiles: u32, size: [u32; 2]) -> Result<
             fork.children[0]
         );
     }
-    let (mut ledger, mut film) = (Ledger::new(image, tiles), FilmPart::new(size));
-    let mut settled = (ledger.snapshot(None), film.clone());
-    let mut lost = None;
-    for (name, record) in &chain.records {
-        ledger.replay(record, name.clone())?;
-        if lost.is_none() {
-            let mut parts = record.made.film.iter().collect::<Vec<_>>();
-            if let Some(snapshot) = &record.snapshot {
-                film = FilmPart::new(size);
-                parts = snapshot.film.iter().collect();
-            }
-            match parts.into_iter().try_for_each(|part| merge(nodes, &mut film, part, size)) {
-                Ok(()) if ledger.is_settled() => settled = (ledger.snapshot(None), film.clone()),
-                Ok(()) => {}
-                Err(e @ JobError::Lost { .. }) => lost = Some(e),
-                Err(e) => return Err(e),
-            }
+    Ok(chain)
+}
+
+/// The state to go on from.
+///
+/// It is found from the newest snapshot on. Where that names what is lost, it is found from an older one, which reaches the same
+/// state by the parts that were added since; where that does not help either, the last state is taken whose film is whole and that
+/// has no rays on their way.
+pub fn resume(nodes: &Nodes, image: &str, scope: &Scope, size: [u32; 2]) -> Result<Resumed, JobError> {
+    let chain = newest_of(image, nodes.wait(read(nodes.store().as_ref()))?)?;
+    let mut best: Option<Replayed> = None;
+    for start in chain.starts() {
+        let found = replay(nodes, image, scope, size, &chain.records[start..])?;
+        if let Some(why) = &found.lost {
+            tracing::warn!("from the snapshot at place {}: {why}", chain.records[start].1.sequence);
+        }
+        let commits = |r: &Replayed| (r.lost.is_none(), r.settled.0.commits);
+        if best.as_ref().is_none_or(|b| commits(&found) > commits(b)) {
+            best = Some(found);
+        }
+        if best.as_ref().is_some_and(|b| b.lost.is_none()) {
+            break;
         }
     }
-    if lost.is_none()
-        && let Err(e) = whole(nodes, &ledger)
-    {
-        lost = Some(e);
-    }
+    let Some(Replayed { mut ledger, film, settled, lost }) = best else {
+        let (ledger, film) = (Ledger::new(image, scope.tiles), FilmPart::new(size));
+        let settled = (ledger.snapshot(None), film.clone());
+        return Ok(Resumed { ledger, film, settled, reused: 0, lost: 0 });
+    };
     let reused = ledger.commits();
     let Some(why) = lost else { return Ok(Resumed { ledger, film, settled, reused, lost: 0 }) };
-    if !matches!(why, JobError::Lost { .. }) {
-        return Err(why);
-    }
     tracing::warn!("{why}; what was committed after the last state without it is computed again");
     let (mut snapshot, film) = settled;
     snapshot.film = store_film(nodes, &film, &format!("film/back-{}", ledger.commits()))?;
@@ -145,9 +154,60 @@ pub fn resume(nodes: &Nodes, image: &str, tiles: u32, size: [u32; 2]) -> Result<
     Ok(Resumed { ledger, film, settled, reused: kept, lost: reused.saturating_sub(kept) })
 }
 
-/// Whether each group that waits has a whole copy.
-fn whole(nodes: &Nodes, ledger: &Ledger) -> Result<(), JobError> {
+/// What records lead to.
+struct Replayed {
+    ledger: Ledger,
+    film: FilmPart,
+    settled: (Snapshot, FilmPart),
+    /// What of it is lost, if anything: then `film` is not that of the state.
+    lost: Option<JobError>,
+}
+
+/// Follows records from a snapshot, or from the first one, to the last.
+fn replay(
+    nodes: &Nodes,
+    image: &str,
+    scope: &Scope,
+    size: [u32; 2],
+    records: &[(String, Record)],
+) -> Result<Replayed, JobError> {
+    let (mut ledger, mut film) = (Ledger::new(image, scope.tiles), FilmPart::new(size));
+    let mut settled = (ledger.snapshot(None), film.clone());
+    let mut lost = None;
+    for (number, (name, record)) in records.iter().enumerate() {
+        // the sum so far is that of a snapshot of the same state
+        let anew = record.snapshot.as_ref().filter(|s| number == 0 || !ledger.is_as(s));
+        scope.replay(&mut ledger, record, name.clone())?;
+        if lost.is_some() {
+            continue;
+        }
+        let mut parts = record.made.film.as_slice();
+        if let Some(snapshot) = anew {
+            film = FilmPart::new(size);
+            parts = snapshot.film.as_slice();
+        }
+        match parts.iter().try_for_each(|part| merge(nodes, &mut film, part, size)) {
+            Ok(()) if ledger.is_settled() => settled = (ledger.snapshot(None), film.clone()),
+            Ok(()) => {}
+            Err(e @ JobError::Lost { .. }) => lost = Some(e),
+            Err(e) => return Err(e),
+        }
+    }
+    if lost.is_none() {
+        match whole(nodes, scope, &ledger) {
+            Err(e @ JobError::Lost { .. }) => lost = Some(e),
+            other => other?,
+        }
+    }
+    Ok(Replayed { ledger, film, settled, lost })
+}
+
+/// Whether each group that waits has a whole copy, and waits for splits of this scene.
+fn whole(nodes: &Nodes, scope: &Scope, ledger: &Ledger) -> Result<(), JobError> {
     for group in ledger.waiting() {
+        if scope.splits.as_ref().is_some_and(|(cut, _)| !is_of_cut(group, cut)) {
+            return Err(JobError::Lost { name: group.key.clone(), why: OTHER_CUT.into() });
+        }
         let open = |body: &Bytes| open(Kind::RayGroup, body, GROUP_LIMIT).map(|_| ());
         nodes.get(0, ByteKind::Rays, &group.key, &group.holders, open)?;
     }
@@ -200,22 +260,23 @@ pub async fn collect(store: Arc<dyn BlockStore>) -> Result<Collected, JobError> 
 async fn collect_owned(store: &dyn BlockStore) -> Result<Collected, JobError> {
     let records = read(store).await?;
     let image = records.values().next().map(|r| r.image.clone()).unwrap_or_default();
-    let Chain { records, .. } = newest(&image, records)?;
+    let chain = newest(&image, records)?;
+    // the last two snapshots stay, with all that leads from there to here: should the newer one turn out to be unreadable
+    let from = chain.starts().get(1).copied().unwrap_or(0);
+    let records = &chain.records[from..];
     let tiles_of = |r: &Record| {
         let taken = r.took.camera.iter().map(|u| u.tile.saturating_add(1)).max();
         r.snapshot.as_ref().map(|s| s.done.tiles()).max(taken).unwrap_or(0)
     };
-    let mut ledger = Ledger::new(&image, records.iter().map(|r| tiles_of(&r.1)).max().unwrap_or(0));
-    let mut names = Vec::new();
-    let mut keys = Vec::new();
-    for (name, record) in &records {
-        if let Some(snapshot) = &record.snapshot {
-            // it holds the sum of all parts before it
-            names = snapshot.film.iter().map(|f| f.key.clone()).collect();
-        }
-        ledger.replay(record, name.clone())?;
-        names.extend(record.made.film.iter().map(|f| f.key.clone()));
-        keys.push(key(record.sequence, name));
+    let tiles = records.iter().map(|r| tiles_of(&r.1)).max().unwrap_or(0);
+    let scope = Scope { tiles, ..Scope::default() };
+    let mut ledger = Ledger::new(&image, tiles);
+    let (mut names, mut keys) = (BTreeSet::new(), BTreeSet::new());
+    for (name, record) in records {
+        scope.replay(&mut ledger, record, name.clone())?;
+        let film = record.snapshot.as_ref().map_or(&record.made.film, |s| &s.film);
+        names.extend(film.iter().map(|f| f.key.clone()));
+        keys.insert(record_key(record.sequence, name));
     }
     names.extend(ledger.waiting().map(|g| g.key.clone()));
     let mut done = Collected::default();
@@ -224,7 +285,7 @@ async fn collect_owned(store: &dyn BlockStore) -> Result<Collected, JobError> {
         for (key, bytes) in store.list(prefix).await? {
             // nodes/N/name
             let name = key.splitn(3, '/').nth(2).unwrap_or_default();
-            if keys.contains(&key) || (prefix != RECORDS && names.iter().any(|n| n == name)) {
+            if keys.contains(&key) || (prefix != RECORDS && names.contains(name)) {
                 done.kept += 1;
             } else {
                 done.objects += 1;

@@ -10,7 +10,7 @@ use bytes::Bytes as Body;
 use rayherd_scene::objects::ObjectRef;
 use tokio::runtime::Runtime;
 
-use super::disks::Disks;
+use super::disks::{Disks, damaged};
 use crate::job::{JobError, JobSettings, PreparedScene};
 use crate::plan::place;
 use crate::report::{Bytes, Kind, NodeReport, Op, Place, Stage};
@@ -258,15 +258,22 @@ impl<'a> Nodes<'a> {
     /// Changes a byte of a copy, for tests.
     pub fn corrupt(&self, holder: u32, name: &str, at: u64) -> Result<(), JobError> {
         let key = disk_key(holder, name);
-        if let Ok(body) = self.wait(self.store.get(&key))
-            && !body.is_empty()
-        {
-            let mut bytes = body.to_vec();
-            let at = at as usize % bytes.len();
-            bytes[at] ^= 0x10;
-            self.wait(self.store.put(&key, bytes.into()))?;
+        if let Ok(body) = self.wait(self.store.get(&key)) {
+            self.wait(self.store.put(&key, damaged(&body, at)))?;
         }
         Ok(())
+    }
+
+    /// Changes a byte of a copy of a block on a disk, for tests. `pick` chooses which: below the number it is given.
+    pub fn corrupt_block(&self, pick: impl Fn(u64) -> u64) -> Result<(), JobError> {
+        let Some(disks) = &self.disks else { return Ok(()) };
+        let split = pick(self.scene.manifest.splits.len() as u64) as usize;
+        let entry = &self.scene.manifest.splits[split];
+        let object =
+            if pick(2) == 0 { (Kind::Geometry, &entry.geometry) } else { (Kind::Attributes, &entry.attributes) };
+        let holders = self.holders.read().unwrap_or_else(PoisonError::into_inner)[split].clone();
+        let node = holders.get(pick(holders.len() as u64) as usize).copied().unwrap_or(0);
+        self.wait(disks.corrupt(node, object, pick(object.1.bytes)))
     }
 
     /// Deletes all copies of objects.

@@ -1,6 +1,7 @@
 //! One writer at a time: an object with a heartbeat says who writes to a store.
 
 use std::fs::read_to_string;
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
@@ -14,8 +15,11 @@ use crate::job::JobError;
 use crate::store::{BlockStore, StoreError};
 
 const KEY: &str = "owner";
-/// A heartbeat older than this is nobody's.
+/// A heartbeat older than this is nobody's, seconds.
 const STALE: u64 = 60;
+/// Who cannot beat stops writing so long after its last heartbeat, seconds: before anybody may take the store for nobody's, with room
+/// for a write that is under way and for clocks that differ.
+const SILENT: u64 = 45;
 /// Time between heartbeats; tests do not wait so long.
 const BEAT: Duration = if cfg!(test) { Duration::from_millis(20) } else { Duration::from_secs(10) };
 
@@ -47,6 +51,8 @@ struct Writer {
     store: Arc<dyn BlockStore>,
     /// Who took the store over, once somebody did.
     taken: Mutex<Option<String>>,
+    /// When the last heartbeat that was written began, seconds since 1970.
+    beaten: AtomicU64,
     over: Notify,
 }
 
@@ -61,8 +67,8 @@ impl Owner {
         let pid = std::process::id();
         let nanos = SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |d| d.as_nanos());
         // several jobs may run in one process
-        static COUNT: std::sync::atomic::AtomicU32 = std::sync::atomic::AtomicU32::new(0);
-        let count = COUNT.fetch_add(1, std::sync::atomic::Ordering::Relaxed);
+        static COUNT: AtomicU64 = AtomicU64::new(0);
+        let count = COUNT.fetch_add(1, Ordering::Relaxed);
         let mut hasher = blake3::Hasher::new();
         hasher
             .update(boot.as_bytes())
@@ -105,7 +111,8 @@ impl Ownership {
             Some(other) => tracing::info!("process {}, which wrote to {}, is gone", other.pid, store.describe()),
             None => {}
         }
-        let writer = Arc::new(Writer { own, store, taken: Mutex::default(), over: Notify::new() });
+        let beaten = AtomicU64::new(own.beat);
+        let writer = Arc::new(Writer { own, store, taken: Mutex::default(), beaten, over: Notify::new() });
         writer.write().await?;
         // of two that begin together the later one stays
         writer.check().await?;
@@ -118,16 +125,16 @@ impl Ownership {
         &self.writer.own.session
     }
 
-    /// Gives the store back.
+    /// Gives the store back. Once is enough; more do no harm.
     ///
     /// # Errors
     /// When somebody else has taken it over, or it cannot be written to.
     pub async fn give_back(&self) -> Result<(), JobError> {
         self.writer.over.notify_one();
         let beating = self.beating.lock().unwrap_or_else(PoisonError::into_inner).take();
-        if let Some(beating) = beating
-            && let Err(e) = beating.await
-        {
+        // given back already: it may be another's by now
+        let Some(beating) = beating else { return Ok(()) };
+        if let Err(e) = beating.await {
             tracing::warn!("{}: the heartbeat ended: {e}", self.writer.store.describe());
         }
         self.writer.check().await?;
@@ -143,15 +150,30 @@ impl Drop for Ownership {
 
 /// What was committed is found by its records; all that is to be said is whether it may be.
 impl Pointer for Ownership {
+    fn check(&self) -> Result<(), JobError> {
+        self.writer.may_write(now())
+    }
     fn move_to(&self, _: u64, _: &str) -> Result<(), JobError> {
-        match &*self.writer.taken.lock().unwrap_or_else(PoisonError::into_inner) {
-            Some(who) => Err(JobError::Owned(who.clone())),
-            None => Ok(()),
-        }
+        self.check()
     }
 }
 
 impl Writer {
+    /// Whether the store is this process's for certain at this time.
+    fn may_write(&self, now: u64) -> Result<(), JobError> {
+        if let Some(who) = &*self.taken.lock().unwrap_or_else(PoisonError::into_inner) {
+            return Err(JobError::Owned(who.clone()));
+        }
+        let silent = now.saturating_sub(self.beaten.load(Ordering::Relaxed));
+        if silent < SILENT {
+            return Ok(());
+        }
+        Err(JobError::Owned(format!(
+            "{} took no heartbeat for {silent} s, so that others may take it over: run again with --resume when it answers",
+            self.store.describe()
+        )))
+    }
+
     /// Beats until the end, or until somebody else has the store.
     async fn beat(self: Arc<Self>) {
         while tokio::time::timeout(BEAT, self.over.notified()).await.is_err() {
@@ -188,7 +210,9 @@ impl Writer {
     async fn write(&self) -> Result<(), JobError> {
         let own = Owner { beat: now(), ..self.own.clone() };
         let body = serde_json::to_vec(&own).map_err(|e| JobError::Internal(e.to_string()))?;
-        Ok(self.store.put(KEY, Bytes::from(body)).await?)
+        self.store.put(KEY, Bytes::from(body)).await?;
+        self.beaten.store(own.beat, Ordering::Relaxed);
+        Ok(())
     }
 }
 
@@ -225,7 +249,7 @@ fn started(pid: u32) -> Option<u64> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::store::MemoryStore;
+    use crate::store::{FaultPlan, Faulty, MemoryStore};
 
     async fn put(store: &dyn BlockStore, owner: &Owner) {
         store.put(KEY, serde_json::to_vec(owner).unwrap().into()).await.unwrap();
@@ -248,6 +272,7 @@ mod tests {
         let third = Ownership::take(store.clone(), false).await.unwrap();
         assert!(is_owned(store.as_ref()).await.unwrap());
         third.give_back().await.unwrap();
+        third.give_back().await.expect("once more is nothing");
         assert!(!is_owned(store.as_ref()).await.unwrap());
         // on another machine, or in another container of this one, only the heartbeat tells
         let container = Owner::this_process().boot.replace("pid:[", "pid:[1");
@@ -260,6 +285,24 @@ mod tests {
             put(store.as_ref(), &other).await;
             assert_eq!(Ownership::take(store.clone(), false).await.is_err(), owned);
         }
+    }
+
+    #[tokio::test]
+    async fn who_cannot_beat_stops_writing_before_others_may_begin() {
+        let faulty = Arc::new(Faulty::new(Arc::new(MemoryStore::default()), FaultPlan::default()));
+        let owner = Ownership::take(faulty.clone(), false).await.unwrap();
+        faulty.lose();
+        tokio::time::sleep(2 * BEAT).await;
+        let beat = owner.writer.beaten.load(Ordering::Relaxed);
+        assert!(owner.writer.may_write(beat + SILENT - 1).is_ok());
+        let late = owner.writer.may_write(beat + SILENT).unwrap_err().to_string();
+        assert!(late.contains("no heartbeat for 45 s") && SILENT < STALE, "{late}");
+        // it comes back, and so does the right to write
+        faulty.restore(None);
+        while owner.writer.beaten.load(Ordering::Relaxed) == beat && owner.writer.may_write(now()).is_ok() {
+            tokio::time::sleep(BEAT).await;
+        }
+        assert!(owner.check().is_ok());
     }
 
     #[tokio::test]

@@ -17,7 +17,8 @@ use super::{JobOutcome, check, journal};
 use crate::driver::{Driver, Pointer, Start};
 use crate::job::{JobError, JobSettings, PreparedScene, Progress, Sampling};
 use crate::ledger::Ledger;
-use crate::store::Spilling;
+use crate::report::SampleKey;
+use crate::store::{BlockStore, Spilling};
 use crate::task::camera::tiles;
 
 /// Ray groups and film parts of a job without a store that stay in memory; what is more goes to a temporary folder.
@@ -37,9 +38,12 @@ pub fn render_local(
     progress: &dyn Progress,
 ) -> Result<JobOutcome, JobError> {
     check(scene, frame, sampling, settings)?;
-    let store = match &settings.commits {
-        Some(commits) => commits.store.clone(),
-        None => Arc::new(Spilling::new(AT_REST_IN_MEMORY)) as _,
+    // a folder that outlives the process by a signal is the system's to clear
+    let spilling = settings.commits.is_none().then(|| Arc::new(Spilling::new(AT_REST_IN_MEMORY, |_| ())));
+    let store = match (&settings.commits, &spilling) {
+        (Some(commits), _) => commits.store.clone(),
+        (None, Some(spilling)) => spilling.clone() as Arc<dyn BlockStore>,
+        (None, None) => return Err(JobError::Internal("a job without a place for its rays".into())),
     };
     let shared = Shared {
         scene,
@@ -60,7 +64,9 @@ pub fn render_local(
             reused: 0,
             redone: 0,
         };
-        return rounds(&shared, start, sampling, progress);
+        let mut made = rounds(&shared, start, sampling, progress)?;
+        made.report.spilled_bytes = spilling.map_or(0, |s| s.spilled());
+        return Ok(made);
     };
     let nodes = &shared.nodes;
     let owner = Ownership::take(nodes.store().clone(), commits.takeover);
@@ -88,7 +94,7 @@ fn resume<'n, 'a>(
         return refuse(format!("{place} holds a job already: resume it, or use another store"));
     }
     let image = shared.scene.image_name(shared.frame)?;
-    let resumed = journal::resume(nodes, &image, tiles(shared.frame), size)?;
+    let resumed = journal::resume(nodes, &image, &journal::scope(shared.scene, shared.frame), size)?;
     let reach = resumed.ledger.done().reach();
     if reach > spp {
         return refuse(format!(
@@ -143,11 +149,12 @@ fn rounds(
     if let Err(e) = discarded {
         tracing::warn!("what came too late to count was not deleted: {e}");
     }
-    let (film, spp, report) = driver.finish()?;
+    let (film, spp, mut report) = driver.finish()?;
     let film = film.into_sum();
-    for (pixel, sample) in &film.rejected().keys {
-        let (x, y) = (pixel % film.size()[0], pixel / film.size()[0]);
+    for &(pixel, sample) in &film.rejected().keys {
+        let [x, y] = [pixel % film.size()[0], pixel / film.size()[0]];
         tracing::warn!("pixel {x},{y} sample {sample}: a contribution is not finite or too large");
+        report.non_finite_at.push(SampleKey { pixel: [x, y], sample });
     }
     Ok(JobOutcome { image: image(&film, spp), film, spp, report })
 }

@@ -99,6 +99,23 @@ fn every_strategy_makes_the_same_bytes() {
 }
 
 #[test]
+fn a_task_that_goes_through_several_splits_loads_each_once_for_all_its_rays() {
+    let settings = JobSettings {
+        memory_per_node: Some(2 * largest(&SCENES[4])),
+        // small batches, so that a task's rays would come in many portions
+        batch: 37,
+        task_seconds: 0.05,
+        ray_buffer: 64 << 20,
+        ..small(Strategy::SchedulingGrid, &[1])
+    };
+    let made = render_local(&SCENES[4], &frame(), &sampling(5), &settings, &Silent).unwrap();
+    assert!(made.film == *expected(5));
+    // the split that holds decided hits may come once more
+    let (passes, tasks) = (made.report.scene_passes, made.report.tasks);
+    assert!(passes <= 1.2 * tasks as f64, "{passes} passes, {tasks} tasks");
+}
+
+#[test]
 fn a_furnace_has_its_closed_form_through_every_strategy() {
     let scene = testing::prepared(&testing::furnace(), 5, true);
     // emission seen after 0, 1, 2 and 3 reflections of one half
@@ -466,4 +483,92 @@ fn every_emitter_makes_the_same_bytes() {
             assert!(made.film == expected.film, "{strategy} on {splits} splits");
         }
     }
+}
+
+#[test]
+fn a_seed_repeats_its_whole_run_on_one_thread() {
+    let (mut hits, mut lost) = (0, 0);
+    for seed in 0..24 {
+        let run = || {
+            let (scene, settings) = random_case(seed);
+            let settings = JobSettings { threads: NonZeroU32::new(1), ..settings };
+            let made = render_local(scene, &small_frame(), &sampling(2), &settings, &Silent).unwrap();
+            let r = made.report;
+            let moved = r.bytes.iter().filter(|b| b.kind != crate::report::Kind::Film);
+            let counts = (r.tasks, r.rounds, r.tasks_redone, r.attempts_lost, r.hops, r.rays);
+            (settings.faults.unwrap().log(), counts, moved.copied().collect::<Vec<_>>())
+        };
+        let (first, second) = (run(), run());
+        assert!(first.0 == second.0, "seed {seed}: another schedule");
+        assert_eq!(first.1, second.1, "seed {seed}");
+        assert_eq!(first.2, second.2, "seed {seed}");
+        hits += first.0.iter().filter(|l| l.2 != faults::Fate::Fine).count();
+        lost += first.1.3;
+    }
+    assert!(hits > 50 && lost > 10, "{hits} faults, {lost} attempts lost");
+}
+
+/// Changes a byte of one object of a job's store, or takes half of it away; its key.
+fn damage(store: &MemoryStore, prefix: &str, pick: &dyn Fn(u64) -> u64) -> Option<String> {
+    let runtime = tokio::runtime::Builder::new_current_thread().build().unwrap();
+    let keys = runtime.block_on(store.list(prefix)).unwrap();
+    let (key, _) = keys.get(pick(keys.len() as u64) as usize)?.clone();
+    let mut body = runtime.block_on(store.get(&key)).unwrap().to_vec();
+    if pick(3) == 0 {
+        body.truncate(body.len() / 2);
+    } else {
+        let at = pick(body.len() as u64) as usize;
+        body[at] ^= 1 << pick(8);
+    }
+    runtime.block_on(store.put(&key, body.into())).unwrap();
+    Some(key)
+}
+
+#[test]
+fn crashes_and_damage_between_them_change_nothing() {
+    let plain = JobSettings { kernel: Kernel::Scalar, ..JobSettings::default() };
+    let expected = render_local(&SCENES[0], &small_frame(), &sampling(2), &plain, &Silent).unwrap().film;
+    let cases = std::env::var("RAYHERD_FAULT_CASES").ok().and_then(|v| v.parse::<u64>().ok()).unwrap_or(200) / 4;
+    let (mut crashes, mut reused, mut redone, mut refused) = (0, 0, 0, 0);
+    for seed in 0..cases {
+        let store = Arc::new(MemoryStore::default());
+        let count = std::cell::Cell::new(0);
+        let pick = |n: u64| {
+            count.set(count.get() + 1);
+            faults::Faults::new(seed ^ 0xc4a5).pick(count.get(), n)
+        };
+        let mut done = false;
+        for run in 0..30 {
+            let runtime = tokio::runtime::Builder::new_current_thread().build().unwrap();
+            let records = runtime.block_on(store.list("records/")).unwrap();
+            let next = records.last().map_or(0, |r| r.0[8..18].parse::<u64>().unwrap() + 1);
+            // now and then under another strategy, which may cut the scene otherwise, and on other nodes
+            let (scene, settings) = random_case(if pick(3) == 0 { seed + run } else { seed });
+            let failing = Arc::new(Crash { after: next + 1 + pick(12), store: store.clone() });
+            let commits = Commits { store: failing, resume: true, takeover: true };
+            let settings = JobSettings { commits: Some(commits), task_seconds: 0.001, ..settings };
+            match render_local(scene, &small_frame(), &sampling(2), &settings, &Silent) {
+                Ok(made) => {
+                    assert!(made.film == expected, "another image: case {seed}");
+                    (reused, redone) = (reused + made.report.tasks_reused, redone + made.report.tasks_redone);
+                    done = true;
+                    break;
+                }
+                Err(JobError::Store(_)) => {
+                    crashes += 1;
+                    damage(&store, ["records/", "nodes/", "nodes/0/film/"][pick(3) as usize], &pick);
+                }
+                // the only record, or the first: nothing to begin from, and that is said
+                Err(JobError::Chain(_)) => {
+                    refused += 1;
+                    let all: Vec<String> = runtime.block_on(store.list("")).unwrap().into_iter().map(|k| k.0).collect();
+                    runtime.block_on(store.delete(&all)).unwrap();
+                }
+                Err(e) => panic!("case {seed}: {e}"),
+            }
+        }
+        assert!(done, "case {seed} does not end");
+    }
+    assert!(crashes as u64 > cases && reused > cases && redone > 0, "{crashes}, {reused}, {redone}, {refused}");
+    assert!(refused < crashes / 2, "{refused} of {crashes} were refused");
 }

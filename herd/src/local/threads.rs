@@ -2,7 +2,7 @@
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender};
-use std::thread::Scope;
+use std::thread::{Builder, Scope};
 use std::time::Duration;
 
 use super::attempt::{Shared, run};
@@ -20,6 +20,8 @@ pub struct Threads<'scope, 'env> {
     gate: &'env Gate,
     send: Sender<Finished>,
     receive: &'env Receiver<Finished>,
+    /// What threads are made with.
+    builder: fn() -> Builder,
 }
 
 impl<'scope, 'env> Threads<'scope, 'env> {
@@ -30,7 +32,7 @@ impl<'scope, 'env> Threads<'scope, 'env> {
         gate: &'env Gate,
         (send, receive): (Sender<Finished>, &'env Receiver<Finished>),
     ) -> Self {
-        Threads { scope, shared, gate, send, receive }
+        Threads { scope, shared, gate, send, receive, builder: Builder::new }
     }
 }
 
@@ -44,7 +46,7 @@ impl Executor for Threads<'_, '_> {
     fn launch(&self, launch: Launch) {
         let Launch { task, number, attempt, stop } = launch;
         let (shared, gate, send) = (self.shared, self.gate, self.send.clone());
-        self.scope.spawn(move || {
+        let work = move || {
             let permit = gate.enter();
             let before = usage::thread_cpu();
             // a panic must end the job with a message, not leave it waiting
@@ -54,7 +56,15 @@ impl Executor for Threads<'_, '_> {
             drop(permit);
             // nobody listens when the job has failed; the nodes have counted the bytes
             let _ = send.send(Finished { task, number, result, cpu, bytes: Bytes::default() });
-        });
+        };
+        if let Err(e) = (self.builder)().spawn_scoped(self.scope, work) {
+            let slots = shared.settings.slots();
+            let message = format!(
+                "no thread for a task: {e}; give fewer slots than {slots}, or let this user have more processes (ulimit -u)"
+            );
+            let result = Err(JobError::Settings(message));
+            let _ = self.send.send(Finished { task, number, result, cpu: 0.0, bytes: Bytes::default() });
+        }
     }
     fn next(&self, wait: Duration) -> Result<Option<Event>, JobError> {
         match self.receive.recv_timeout(wait) {
@@ -62,5 +72,41 @@ impl Executor for Threads<'_, '_> {
             Err(RecvTimeoutError::Timeout) => Ok(None),
             Err(RecvTimeoutError::Disconnected) => Err(JobError::Internal("all threads are gone".into())),
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Arc;
+    use std::sync::mpsc::channel;
+
+    use super::*;
+    use crate::job::{JobSettings, PreparedScene};
+    use crate::ledger::TaskId;
+    use crate::local::attempt::Attempt;
+    use crate::local::nodes::Nodes;
+    use crate::local::slots::StopFlag;
+    use crate::plan::Set;
+    use crate::store::MemoryStore;
+    use crate::testing;
+
+    #[test]
+    fn a_thread_that_is_refused_ends_its_attempt_with_a_message() {
+        let scene: PreparedScene = testing::prepared(&testing::cornell(), 1, true);
+        let (frame, settings) = (testing::frame(&scene, [8, 8], 1), JobSettings::default());
+        let nodes = Nodes::new(&scene, &settings, Arc::new(MemoryStore::default())).unwrap();
+        let shared = Shared { scene: &scene, frame: &frame, settings: &settings, nodes, store_film: false, buckets: 1 };
+        let (gate, (send, receive)) = (Gate::new(1), channel());
+        std::thread::scope(|scope| {
+            let threads = Threads::new(scope, &shared, &gate, (send, &receive));
+            // no machine has so much room for a stack
+            let threads = Threads { builder: || Builder::new().stack_size(1 << 60), ..threads };
+            let attempt = Attempt { name: "a".into(), node: 0, set: Set::Any, groups: vec![], camera: vec![] };
+            threads.launch(Launch { task: TaskId(3), number: 1, attempt, stop: StopFlag::default() });
+            let Some(Event::Finished(finished)) = threads.next(Duration::ZERO).unwrap() else { panic!("nothing") };
+            assert_eq!((finished.task, finished.number), (TaskId(3), 1));
+            let error = finished.result.err().unwrap();
+            assert!(error.is_users() && error.to_string().contains("slots"), "{error}");
+        });
     }
 }

@@ -31,18 +31,18 @@ const ASSUMED: f64 = 10_000.0;
 
 /// What of a space is boundary when it is cut into so many parts, by how many a straight line passes: the cube root of
 /// their number, less the one part in which it begins. 0 for one part.
-fn boundaries(windows: usize) -> f64 {
-    libm::cbrt(windows as f64) - 1.0
+fn boundaries(parts: f64) -> f64 {
+    libm::cbrt(parts) - 1.0
 }
 
 impl Traffic {
-    /// Counts a task: camera rays made, rays traced in a cut of so many windows, rays that left, bytes of their groups.
-    pub fn add(&mut self, camera: u64, rays: u64, windows: usize, hops: u64, bytes: u64) {
+    /// Counts a task: camera rays made, rays traced in a cut into so many parts, rays that left, bytes of their groups.
+    pub fn add(&mut self, camera: u64, rays: u64, parts: f64, hops: u64, bytes: u64) {
         self.camera += camera as f64;
         self.rays += rays as f64;
         self.hops += hops as f64;
         self.bytes += bytes as f64;
-        self.exposed += rays as f64 * boundaries(windows);
+        self.exposed += rays as f64 * boundaries(parts);
     }
     /// Rays traced for each camera ray, itself included. Assumed: itself and one more.
     pub fn rays_per_camera(&self) -> f64 {
@@ -52,10 +52,10 @@ impl Traffic {
     pub fn bytes_per_hop(&self) -> f64 {
         (self.bytes + 20.0 * ASSUMED) / (self.hops + ASSUMED)
     }
-    /// Hops of a ray in a cut of so many windows. Assumed: a third of what a line through the whole scene makes, as most
+    /// Hops of a ray in a cut into so many parts. Assumed: a third of what a line through the whole scene makes, as most
     /// rays are shorter.
-    pub fn hops_per_ray(&self, windows: usize) -> f64 {
-        (self.hops + ASSUMED / 3.0) / (self.exposed + ASSUMED) * boundaries(windows)
+    pub fn hops_per_ray(&self, parts: f64) -> f64 {
+        (self.hops + ASSUMED / 3.0) / (self.exposed + ASSUMED) * boundaries(parts)
     }
     /// Cost of a ray's way to the node that it waits for: a copy written here, the others elsewhere, one read there.
     pub fn hop(&self, replicas: u32) -> f64 {

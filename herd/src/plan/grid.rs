@@ -3,6 +3,7 @@
 use std::cmp::Reverse;
 use std::collections::{BTreeMap, BTreeSet};
 
+use super::cost::{RAY, REMOTE};
 use super::{Assignment, Set, Strategy, View, Waiting, free_slots, take};
 
 pub(super) fn plan(view: &View) -> Vec<Assignment> {
@@ -11,26 +12,27 @@ pub(super) fn plan(view: &View) -> Vec<Assignment> {
         reduce(view, &mut out);
         return out;
     }
+    let idle = view.nodes.iter().all(|n| n.free == n.slots);
     let rays: BTreeMap<u32, u64> =
         view.waiting.iter().map(|(&s, g)| (s, g.iter().map(|g| g.rays).sum())).filter(|&(_, n)| n > 0).collect();
     if !rays.is_empty() {
-        for (split, node) in choose(view, &rays) {
+        for (split, node) in choose(view, &rays, idle) {
             let groups = take(&mut largest_first(&view.waiting[&split]).into_iter(), view.task_rays);
             out.push(Assignment { node, set: set(view, split), groups, camera: None });
         }
     } else {
-        camera(view, &mut out);
+        camera(view, idle, &mut out);
     }
     out
 }
 
 /// Camera rays of all start splits, in as many tasks as there are slots: all rays of a round are on their way before
 /// the next round reads a split for them.
-fn camera(view: &View, out: &mut Vec<Assignment>) {
+fn camera(view: &View, idle: bool, out: &mut Vec<Assignment>) {
     let mut left = view.camera.clone();
     let mut nodes = view.nodes.to_vec();
     loop {
-        let chosen = choose(&View { nodes: &nodes, ..view.clone() }, &left);
+        let chosen = choose(&View { nodes: &nodes, ..view.clone() }, &left, idle && out.is_empty());
         if chosen.is_empty() {
             return;
         }
@@ -55,51 +57,120 @@ fn largest_first(groups: &[Waiting]) -> Vec<Waiting> {
     groups
 }
 
-/// Splits with their nodes: most rays first, each where it is warm, else where it lies. A split whose nodes are all
-/// busy is left for the next round, unless it has at least half of the rays of the fullest one: then any free slot
-/// will do, because a slot that waits for it costs more than its bytes.
-pub(super) fn choose(view: &View, rays: &BTreeMap<u32, u64>) -> Vec<(u32, u32)> {
-    let mut free: Vec<u32> = view.nodes.iter().map(|n| n.free).collect();
-    // memory that no warm split takes: a split that finds room there stays warm, and nothing is evicted for it
-    let warm_bytes = |n: &super::NodeView| n.warm.iter().map(|&s| view.splits[s as usize].bytes).sum::<u64>();
-    let mut room: Vec<u64> = view.nodes.iter().map(|n| n.memory.saturating_sub(warm_bytes(n))).collect();
+/// Splits with their nodes: most rays first, each where it is warm, else where it lies. Of the splits whose nodes these are, as many
+/// of those with most rays get a slot as can at once: one that came first makes way when another of its own nodes will do.
+///
+/// A split whose nodes are all busy is left for the next round, unless it has at least half of the rays of the fullest one and is
+/// worth it: a slot that stands idle for its rays costs more than reading it from another node. With `any`, something is
+/// chosen whatever it costs.
+pub(super) fn choose(view: &View, rays: &BTreeMap<u32, u64>, any: bool) -> Vec<(u32, u32)> {
     let mut splits: Vec<(u32, u64)> = rays.iter().map(|(&s, &r)| (s, r)).filter(|&(_, r)| r > 0).collect();
     splits.sort_by_key(|&(s, r)| (Reverse(r), s));
     let most = splits.first().map_or(0, |s| s.1);
-    let mut out = Vec::new();
+    let mut seats = Seats::new(view);
     let mut later = Vec::new();
     for &(split, rays) in &splits {
-        let warm: Vec<u32> = (0..free.len() as u32).filter(|&n| view.nodes[n as usize].warm.contains(&split)).collect();
-        let disks: BTreeSet<u32> = view.splits[split as usize].holders.iter().copied().collect();
-        let bytes = view.splits[split as usize].bytes;
-        let roomy = disks.iter().copied().filter(|&n| room.get(n as usize).is_some_and(|&r| r >= bytes));
-        let node = if warm.is_empty() {
-            freest(&free, roomy).or_else(|| freest(&free, disks.iter().copied()))
-        } else {
-            freest(&free, warm.iter().copied())
-        };
-        match node {
-            Some(node) => {
-                free[node as usize] -= 1;
-                if warm.is_empty() {
-                    room[node as usize] = room[node as usize].saturating_sub(bytes);
-                }
-                out.push((split, node));
-            }
-            None => later.push((split, rays)),
+        if !seats.seat(split, &mut BTreeSet::new()) {
+            later.push((split, rays));
         }
     }
     for (split, rays) in later {
-        if 2 * rays < most && !out.is_empty() {
+        if 2 * rays < most && !(any && seats.taken.is_empty()) {
             break;
         }
-        let disks = view.splits[split as usize].holders.iter().copied();
-        if let Some(node) = freest(&free, disks).or_else(|| freest(&free, 0..free.len() as u32)) {
-            free[node as usize] -= 1;
-            out.push((split, node));
+        let disks = seats.live_holders(split);
+        let bytes = view.splits[split as usize].bytes;
+        let worth = rays.min(view.task_rays).saturating_mul(RAY) >= bytes.saturating_mul(REMOTE);
+        let anywhere = worth || disks.is_empty() || (any && seats.taken.is_empty());
+        let near = freest(&seats.free, disks.into_iter());
+        let node = near.or_else(|| freest(&seats.free, 0..seats.free.len() as u32).filter(|_| anywhere));
+        if let Some(node) = node {
+            seats.take(split, node);
         }
     }
-    out
+    seats.taken
+}
+
+/// Slots that are free, and who gets them.
+struct Seats<'v, 'a> {
+    view: &'v View<'a>,
+    free: Vec<u32>,
+    /// Memory that no warm split takes: a split that finds room there stays warm, and nothing is evicted for it.
+    room: Vec<i128>,
+    taken: Vec<(u32, u32)>,
+}
+
+impl<'v, 'a> Seats<'v, 'a> {
+    fn new(view: &'v View<'a>) -> Self {
+        let bytes = |s: &u32| i128::from(view.splits[*s as usize].bytes);
+        let room = |n: &super::NodeView| i128::from(n.memory) - n.warm.iter().map(bytes).sum::<i128>();
+        Seats {
+            view,
+            free: view.nodes.iter().map(|n| n.free).collect(),
+            room: view.nodes.iter().map(room).collect(),
+            taken: Vec::new(),
+        }
+    }
+
+    fn live_holders(&self, split: u32) -> Vec<u32> {
+        let holders = self.view.splits[split as usize].holders.iter().copied();
+        let live = |&n: &u32| self.view.nodes.get(n as usize).is_some_and(|n| n.slots > 0);
+        holders.filter(live).collect::<BTreeSet<u32>>().into_iter().collect()
+    }
+
+    /// The nodes where a split belongs, and whether it is warm there.
+    fn own(&self, split: u32) -> (Vec<u32>, bool) {
+        let warm = |&n: &u32| {
+            let node = &self.view.nodes[n as usize];
+            node.slots > 0 && node.warm.contains(&split)
+        };
+        let warm: Vec<u32> = (0..self.free.len() as u32).filter(warm).collect();
+        if warm.is_empty() { (self.live_holders(split), false) } else { (warm, true) }
+    }
+
+    fn take(&mut self, split: u32, node: u32) {
+        self.free[node as usize] -= 1;
+        if !self.view.nodes[node as usize].warm.contains(&split) {
+            self.room[node as usize] -= i128::from(self.view.splits[split as usize].bytes);
+        }
+        self.taken.push((split, node));
+    }
+
+    fn leave(&mut self, split: u32, node: u32) {
+        self.taken.retain(|&t| t != (split, node));
+        self.free[node as usize] += 1;
+        if !self.view.nodes[node as usize].warm.contains(&split) {
+            self.room[node as usize] += i128::from(self.view.splits[split as usize].bytes);
+        }
+    }
+
+    /// Gives a split a slot of one of its own nodes, if need be by moving others to other nodes of theirs (an augmenting path). `tried`
+    /// are nodes from which nobody can be moved. Whoever has a slot keeps one.
+    fn seat(&mut self, split: u32, tried: &mut BTreeSet<u32>) -> bool {
+        let (own, warm) = self.own(split);
+        let bytes = i128::from(self.view.splits[split as usize].bytes);
+        let roomy = own.iter().copied().filter(|&n| !warm && self.room[n as usize] >= bytes);
+        if let Some(node) = freest(&self.free, roomy).or_else(|| freest(&self.free, own.iter().copied())) {
+            self.take(split, node);
+            return true;
+        }
+        for node in own {
+            if !tried.insert(node) {
+                continue;
+            }
+            // those with fewest rays came last, and move first
+            for at in (0..self.taken.len()).rev().filter(|&at| self.taken[at].1 == node).collect::<Vec<_>>() {
+                let (other, _) = self.taken[at];
+                if self.seat(other, tried) {
+                    // it has two slots now: the old one is free
+                    self.leave(other, node);
+                    self.take(split, node);
+                    return true;
+                }
+            }
+        }
+        false
+    }
 }
 
 /// The node with most free slots, the first of equals.

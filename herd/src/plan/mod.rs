@@ -15,7 +15,6 @@ pub mod rate;
 mod tests;
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::ops::Range;
 
 pub use rayherd_api::Strategy;
 use serde::{Deserialize, Serialize};
@@ -51,6 +50,9 @@ pub struct Waiting {
     pub rays: u64,
 }
 
+/// Splits that a task of `auto` holds together, ascending, in the order of [`place::order`].
+pub type Window = Vec<u32>;
+
 /// All that a plan depends on.
 #[derive(Clone, Debug)]
 pub struct View<'a> {
@@ -77,7 +79,7 @@ pub struct View<'a> {
     /// Scene data that one task can hold, bytes.
     pub forest: u64,
     /// For `auto`: windows that cover the splits, as [`cut::choose`] made them; none where they move.
-    pub cut: &'a [Range<u32>],
+    pub cut: &'a [Window],
     /// What rays did so far.
     pub traffic: cost::Traffic,
 }

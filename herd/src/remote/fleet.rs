@@ -45,6 +45,8 @@ struct State {
     common: VecDeque<(u64, Work)>,
     doing: BTreeMap<String, Doing>,
     finished: VecDeque<Finished>,
+    /// Workers that went away since this was told last.
+    emptied: BTreeSet<u32>,
     answers: BTreeMap<u64, Result<Done, Failure>>,
     failures: u32,
     bytes: Bytes,
@@ -105,6 +107,7 @@ impl Fleet {
         state.placement = placement;
         state.size = stage.frame.size;
         state.stage = Some(stage);
+        state.emptied.clear();
         state.workers.iter_mut().flatten().for_each(|w| w.open = false);
         self.wanted.notify_waiters();
     }
@@ -328,6 +331,7 @@ impl State {
     /// A worker is gone: what it did is lost, what any worker can do is done by another.
     fn leave(&mut self, number: u32) {
         let Some(worker) = self.workers[number as usize].take() else { return };
+        self.emptied.insert(number);
         for (task, attempt, _, _) in worker.ready {
             self.lose(task, attempt);
         }
@@ -415,8 +419,11 @@ impl Executor for Fleet {
         let mut state = self.lock();
         state.check()?;
         state.sweep();
-        if state.finished.is_empty() {
+        if state.finished.is_empty() && state.emptied.is_empty() {
             state = self.wait(state, wait);
+        }
+        if let Some(worker) = state.emptied.pop_first() {
+            return Ok(Some(Event::MemoryLost(worker)));
         }
         Ok(state.finished.pop_front().map(|f| Event::Finished(f.into())))
     }

@@ -13,13 +13,12 @@ use super::parts::Parts;
 use super::{Depot, Fleet, Turns};
 use crate::driver::{Driver, Pointer, Start};
 use crate::job::{JobError, JobSettings, NodeSpec, PreparedScene, Progress, Sampling, spec as from_spec};
-use crate::ledger::{FilmRef, Ledger, Snapshot, newest};
+use crate::ledger::{FilmRef, Ledger, Scope, Snapshot, is_of_cut, record_key};
 use crate::local::attempt::Shared;
 use crate::local::journal;
 use crate::local::nodes::{Nodes, placement};
 use crate::report;
 use crate::store::SceneObjects;
-use crate::task::camera::tiles;
 
 /// How long the first plan of a frame waits for workers that are not there yet.
 const GATHER: Duration = Duration::from_secs(3);
@@ -141,21 +140,29 @@ fn render(
         buckets: stage.buckets,
     };
     let image = scene.image_name(&stage.frame)?;
-    let resumed = resume(&shared.nodes, &image, tiles(&stage.frame), keeper.newest(number))?;
+    let states = resume(&shared.nodes, &image, &journal::scope(scene, &stage.frame), keeper.newest(number))?;
     let pointer = FramePointer { keeper: keeper.clone(), frame: number };
+    job.fleet.open(stage.clone(), places.to_vec());
+    let (resumed, film_lost) = whole(job.fleet, states)?;
+    // rays that wait for splits of another cut of the scene are of no use
+    let other_cut = resumed.ledger.waiting().find(|g| !is_of_cut(g, &scene.cut)).map(|g| g.key.clone());
+    let other_cut = other_cut.map(|name| JobError::Lost { name, why: journal::OTHER_CUT.into() });
+    let lost = film_lost.or(other_cut);
     let start = Start {
-        reused: resumed.ledger.commits(),
+        reused: if lost.is_some() { resumed.settled.0.commits } else { resumed.ledger.commits() },
         ledger: resumed.ledger,
         film: Parts::new(job.fleet, resumed.film, resumed.settled.1),
         settled: resumed.settled.0,
         pointer: Some(Arc::new(pointer)),
         session: job.session.clone(),
-        redone: 0,
+        redone: resumed.lost,
     };
-    job.fleet.open(stage.clone(), places.to_vec());
     // the first plan decides who holds what: better with all who are about to come
     job.fleet.gather(GATHER)?;
     let mut driver = Driver::new(&shared, start, sampling, progress);
+    if let Some(why) = lost {
+        driver.go_back(&why)?;
+    }
     if let Err(e) = driver.run(job.fleet) {
         driver.stop_all();
         return Err(e);
@@ -178,33 +185,77 @@ impl Pointer for FramePointer {
     }
 }
 
-/// The state to go on from, with film parts by reference.
+/// A state to go on from, with film parts by reference.
 struct Resumed {
     ledger: Ledger,
     film: Vec<FilmRef>,
     settled: (Snapshot, Vec<FilmRef>),
+    /// Records of the pointer's chain that are lost.
+    lost: u64,
 }
 
-/// Follows the chain that ends at the pointer. Records beyond it do not count: whoever wrote them did not move it.
-fn resume(nodes: &Nodes, image: &str, tiles: u32, pointer: Option<(u64, String)>) -> Result<Resumed, JobError> {
-    let mut ledger = Ledger::new(image, tiles);
-    let (mut film, mut settled) = (Vec::new(), (ledger.snapshot(None), Vec::new()));
-    let Some((sequence, name)) = pointer else { return Ok(Resumed { ledger, film, settled }) };
+/// Follows the chain that ends at the pointer, from its newest snapshot on, and then from each older one. Records beyond the pointer do
+/// not count: whoever wrote them did not move it.
+///
+/// Where the pointer's record cannot be read, or what it stands on, the newest chain before it is followed: what came later is
+/// computed again.
+fn resume(nodes: &Nodes, image: &str, scope: &Scope, pointer: Option<(u64, String)>) -> Result<Vec<Resumed>, JobError> {
+    let begin = || {
+        let ledger = Ledger::new(image, scope.tiles);
+        Resumed { settled: (ledger.snapshot(None), Vec::new()), ledger, film: Vec::new(), lost: 0 }
+    };
+    let Some((sequence, name)) = pointer else { return Ok(vec![begin()]) };
     let mut records = nodes.wait(journal::read(nodes.store().as_ref()))?;
     records.retain(|n, r| r.sequence < sequence || *n == name);
-    if !records.contains_key(&name) {
-        let place = nodes.store().describe();
-        return Err(JobError::Lost { name, why: format!("{place} lacks the newest round record") });
+    let chain = journal::newest_of(image, records)?;
+    let place = nodes.store().describe();
+    let Some((tip, last)) = chain.records.last() else {
+        return Err(JobError::Lost { name, why: format!("{place} lacks the newest round record and all before it") });
+    };
+    let lost = sequence.saturating_sub(last.sequence);
+    if *tip != name {
+        let newest = record_key(sequence, &name);
+        tracing::warn!("{place}: {newest}, or what it stands on, is lost: {lost} record(s) before it are gone back");
     }
-    for (name, record) in newest(image, records)?.records {
-        if let Some(snapshot) = &record.snapshot {
-            film = snapshot.film.iter().cloned().collect();
+    let replayed = chain.starts().into_iter().map(|start| {
+        let mut state = Resumed { lost, ..begin() };
+        for (number, (name, record)) in chain.records[start..].iter().enumerate() {
+            // the parts so far are the sum of a snapshot of the same state
+            let anew = record.snapshot.as_ref().filter(|s| number == 0 || !state.ledger.is_as(s));
+            scope.replay(&mut state.ledger, record, name.clone())?;
+            if let Some(snapshot) = anew {
+                state.film = snapshot.film.iter().cloned().collect();
+            }
+            state.film.extend(record.made.film.clone());
+            if state.ledger.is_settled() {
+                state.settled = (state.ledger.snapshot(None), state.film.clone());
+            }
         }
-        film.extend(record.made.film.clone());
-        ledger.replay(&record, name)?;
-        if ledger.is_settled() {
-            settled = (ledger.snapshot(None), film.clone());
+        Ok(state)
+    });
+    replayed.collect()
+}
+
+/// The first of some states whose film is whole; else the one with most in it of those that can be gone back to, and what is lost.
+fn whole(fleet: &Fleet, states: Vec<Resumed>) -> Result<(Resumed, Option<JobError>), JobError> {
+    let is_whole = |parts: &[FilmRef]| match Parts::new(fleet, parts.to_vec(), Vec::new()).merge(None, 1, None) {
+        Ok(_) => Ok(None),
+        Err(e @ JobError::Lost { .. }) => Ok(Some(e)),
+        Err(e) => Err(e),
+    };
+    let mut best: Option<(Resumed, Option<JobError>)> = None;
+    for mut state in states {
+        // nothing to read, and nobody there to read it yet
+        let lost = if state.film.is_empty() { None } else { is_whole(&state.film)? };
+        let Some(why) = lost else { return Ok((state, None)) };
+        tracing::warn!("{why}; an older snapshot is tried");
+        if !state.settled.1.is_empty() && is_whole(&state.settled.1)?.is_some() {
+            let nothing = Ledger::new(state.ledger.image(), state.ledger.done().tiles());
+            state.settled = (nothing.snapshot(None), Vec::new());
+        }
+        if best.as_ref().is_none_or(|(b, _)| state.settled.0.commits > b.settled.0.commits) {
+            best = Some((state, Some(why)));
         }
     }
-    Ok(Resumed { ledger, film, settled })
+    best.ok_or_else(|| JobError::Internal("no state to go on from".into()))
 }

@@ -64,7 +64,11 @@ pub fn prepare_scene(
         if let Some(map) = &prepared.manifest.sky_map {
             put(&[], map)?;
         }
-        put(&[], &prepared.reference)?;
+    }
+    // a new one, or the same scene for another picture
+    if staged.built.has(&prepared.reference)? {
+        let body = staged.built.get(&prepared.reference)?;
+        runtime.block_on(store.put(&object_key(&prepared.reference.hash), body.into()))?;
         // last: whoever finds the name finds everything that it names
         if let Some((name, object)) = staged.name.lock().unwrap_or_else(PoisonError::into_inner).take() {
             staged.stored.set_name(&name, &object)?;

@@ -14,8 +14,9 @@ use tokio::runtime::{Handle, Runtime};
 use super::frames::{Job, Keeper, run};
 use super::message::{Answer, Beat, Poll, Report, WorkerId};
 use super::{Depot, Fleet, Link, LinkError, Station, Turns};
+use crate::driver::{Event, Executor};
 use crate::job::{JobError, JobSettings, PreparedScene, Sampling, Silent, spec as from_spec};
-use crate::local::render_local;
+use crate::local::{journal, render_local};
 use crate::picture;
 use crate::report;
 use crate::store::{BlockStore, FaultPlan, Faulty, MemoryStore};
@@ -88,7 +89,10 @@ impl Keeper for Kept {
     }
     fn move_to(&self, frame: u32, sequence: u64, name: &str) -> Result<(), JobError> {
         let old = self.pointers.lock().unwrap().insert(frame, (sequence, name.to_owned()));
-        assert!(old.is_none_or(|o| o.0 + 1 == sequence), "the pointer moves by one record");
+        assert!(
+            old.is_none_or(|o| o.0 + 1 >= sequence),
+            "the pointer moves by one record, or back to what can be read"
+        );
         Ok(())
     }
     fn prepared(&self, scene: &ObjectRef, reused: bool) {
@@ -284,6 +288,67 @@ fn workers_and_operators_that_go_change_no_byte() {
     assert!(kept.reports.lock().unwrap()[0].tasks_reused > 0);
 }
 
+/// Runs a job until so many records count, then stops its operator.
+fn begun(cluster: &Cluster, spec: &RenderJobSpec, kept: &Arc<Kept>, records: u64) {
+    let (fleet, depot) = (Fleet::new(3, "e1"), cluster.depot(None));
+    let wire = cluster.wire(&fleet);
+    std::thread::scope(|scope| {
+        for number in 0..3 {
+            let station = cluster.station(&wire, number, "s1", Some(number));
+            scope.spawn(move || station.run().unwrap());
+        }
+        let keeper: Arc<dyn Keeper> = kept.clone();
+        let (depot, fleet) = (&depot, &fleet);
+        let job = scope.spawn(move || run(&cluster.job(spec, depot, fleet, "e1"), &keeper, &Silent));
+        wait_for(|| kept.newest(0).is_some_and(|p| p.0 >= records) || job.is_finished());
+        fleet.cancel("stopped by the test");
+        let stopped = job.join().unwrap();
+        assert!(matches!(stopped, Err(JobError::Owned(_))), "{:?}", stopped.err());
+        fleet.end();
+    });
+}
+
+#[test]
+fn an_unreadable_record_or_snapshot_costs_work_and_not_the_job() {
+    let mut spec = spec(Strategy::SchedulingGridOverlapReduced, 4, 2);
+    spec.sampling.spp = Some(6);
+    spec.task_seconds = Some(0.003);
+    let want = expected(&spec);
+    for broken in ["the pointer's record", "the newest snapshot", "the newest snapshot's film", "all film"] {
+        let (cluster, kept) = (Cluster::new(3), Arc::new(Kept::default()));
+        begun(&cluster, &spec, &kept, 40);
+        let part = cluster.depot(None).part("jobs/1/0", 2).unwrap();
+        let (sequence, name) = kept.newest(0).unwrap();
+        let mut records = cluster.runtime.block_on(journal::read(&part)).unwrap();
+        records.retain(|n, r| r.sequence < sequence || *n == name);
+        let snapshots = records.iter().filter(|r| r.1.snapshot.is_some());
+        let (snapshot, record) = snapshots.max_by_key(|r| r.1.sequence).expect("there are snapshots");
+        let film = record.snapshot.as_ref().and_then(|s| s.film.as_ref()).map(|f| f.key.as_str());
+        let wrong = match broken {
+            "the pointer's record" => name.as_str(),
+            "the newest snapshot" => snapshot.as_str(),
+            "the newest snapshot's film" => film.expect("a snapshot with film"),
+            _ => "film/",
+        };
+        let mut damaged = 0;
+        for store in &cluster.stores {
+            for (key, _) in cluster.runtime.block_on(store.list("jobs/1/0/")).unwrap() {
+                if key.contains(wrong) {
+                    cluster.runtime.block_on(store.damage(&key)).unwrap();
+                    damaged += 1;
+                }
+            }
+        }
+        assert!(damaged > 0, "{broken}");
+        if let Err(e) = cluster.render(&spec, &kept) {
+            panic!("{broken}: {e}");
+        }
+        assert!(cluster.picture(1) == want, "{broken}");
+        let reports = kept.reports.lock().unwrap();
+        assert_eq!(reports[0].tasks_reused > 0, broken != "all film", "{broken}: {:?}", reports[0]);
+    }
+}
+
 #[test]
 fn a_worker_that_comes_back_under_another_session_loses_only_its_tasks() {
     let fleet = Fleet::new(1, "e");
@@ -328,6 +393,9 @@ fn a_worker_that_comes_back_under_another_session_loses_only_its_tasks() {
         let done = call.join().unwrap().unwrap();
         assert!(matches!(done, super::message::Done::Merged { rel_mse: Some(x), .. } if x == 3.0));
     });
+    // the loop over rounds learns that the one that came back holds nothing
+    let told = fleet.next(Duration::ZERO).unwrap();
+    assert!(matches!(told, Some(Event::MemoryLost(0))) && fleet.next(Duration::ZERO).unwrap().is_none());
 }
 
 #[test]

@@ -62,7 +62,13 @@ async fn says_not_found(store: &dyn BlockStore) {
     store.delete(&[key.to_owned()]).await.expect("deleting what is not there is no error");
     store.delete(&[]).await.expect("nor is deleting nothing");
     store.put(key, Bytes::from_static(b"x")).await.unwrap();
-    store.delete(&[key.to_owned(), "conformance/never".to_owned()]).await.unwrap();
+    let twice = [key.to_owned(), "conformance/never".to_owned(), key.to_owned()];
+    store.delete(&twice).await.expect("one key may be named twice");
+    absent().await;
+    store.delete(&twice).await.expect("deleting again is deleting nothing");
+    store.put(key, Bytes::from_static(b"y")).await.unwrap();
+    assert_eq!(store.get(key).await.unwrap(), "y", "what was deleted can be put again");
+    store.delete(&[key.to_owned()]).await.unwrap();
     absent().await;
 }
 

@@ -18,7 +18,7 @@ pub fn kind_of_key(key: &str) -> Kind {
         "attributes" => Some(Kind::Attributes),
         "texture" => Some(Kind::Texture),
         "rays" => Some(Kind::Rays),
-        "film" | "rounds" => Some(Kind::Film),
+        "film" | "records" => Some(Kind::Film),
         _ => None,
     });
     named.unwrap_or(Kind::Manifest)
@@ -132,5 +132,6 @@ mod tests {
         );
         assert_eq!(counters.sums().sum(|_, _, _, place| place == Place::Remote), 127);
         assert_eq!(kind_of_key("job/owner"), Kind::Manifest);
+        assert_eq!(kind_of_key("jobs/1/records/0000000003-ab"), Kind::Film);
     }
 }

@@ -1,36 +1,48 @@
-//! Objects in memory up to a budget, then in a temporary folder: what a job without a store keeps while it runs.
+//! Objects in memory up to a budget, then in a temporary folder: what a run without a store keeps while it lasts.
 
-use std::sync::{Mutex, PoisonError};
+use std::path::Path;
+use std::sync::{Arc, Mutex, PoisonError};
 
 use async_trait::async_trait;
 use bytes::Bytes;
 use tempfile::TempDir;
 
-use super::{BlockStore, DirectoryStore, MemoryStore, StoreError};
+use super::{BlockStore, Counters, Counting, DirectoryStore, MemoryStore, StoreError};
+use crate::report::{Op, Place, Stage};
 
 /// Objects that vanish with this value. The folder is made when the first object does not fit into memory.
 pub struct Spilling {
     memory: MemoryStore,
-    folder: Mutex<Option<(TempDir, DirectoryStore)>>,
+    folder: Mutex<Option<(TempDir, Arc<Counting>)>>,
+    made: fn(&Path),
+    counters: Counters,
 }
 
 impl Spilling {
-    /// Up to `budget` bytes of bodies stay in memory.
-    pub fn new(budget: u64) -> Self {
-        Spilling { memory: MemoryStore::with_limit(budget), folder: Mutex::default() }
+    /// Up to `budget` bytes of bodies stay in memory. `made` is told of the folder when there is one.
+    pub fn new(budget: u64, made: fn(&Path)) -> Self {
+        let (memory, counters) = (MemoryStore::with_limit(budget), Counters::new());
+        Spilling { memory, folder: Mutex::default(), made, counters }
     }
 
-    fn folder(&self) -> Option<DirectoryStore> {
+    /// Bytes that were written to the folder so far.
+    pub fn spilled(&self) -> u64 {
+        self.counters.sums().sum(|_, op, _, _| op == Op::Write)
+    }
+
+    fn folder(&self) -> Option<Arc<Counting>> {
         self.folder.lock().unwrap_or_else(PoisonError::into_inner).as_ref().map(|f| f.1.clone())
     }
 
-    fn folder_or_new(&self) -> Result<DirectoryStore, StoreError> {
+    fn folder_or_new(&self) -> Result<Arc<Counting>, StoreError> {
         let mut folder = self.folder.lock().unwrap_or_else(PoisonError::into_inner);
         if let Some((_, store)) = folder.as_ref() {
             return Ok(store.clone());
         }
-        let made = temporary_folder("rayherd-rays-")?;
-        let store = DirectoryStore::open_unsynced(made.path())?;
+        let made = temporary_folder("rayherd-")?;
+        (self.made)(made.path());
+        let store = Arc::new(DirectoryStore::open_unsynced(made.path())?);
+        let store = Arc::new(Counting::new(store, self.counters.clone(), Stage::Trace, Place::Local));
         *folder = Some((made, store.clone()));
         Ok(store)
     }
@@ -104,17 +116,18 @@ mod tests {
     #[tokio::test]
     async fn conforms_with_and_without_room() {
         for budget in [0, 100_000, u64::MAX] {
-            super::super::conformance::conformance(&Spilling::new(budget)).await;
+            super::super::conformance::conformance(&Spilling::new(budget, |_| ())).await;
         }
     }
 
     #[tokio::test]
     async fn what_memory_does_not_hold_is_in_a_folder_that_goes() {
-        let store = Spilling::new(10);
+        let store = Spilling::new(10, |_| ());
         store.put("a", Bytes::from_static(b"12345678")).await.unwrap();
         assert!(store.folder().is_none());
         store.put("b", Bytes::from_static(b"123")).await.unwrap();
-        let root = store.folder().unwrap().root().to_path_buf();
+        assert_eq!(store.spilled(), 3);
+        let root = std::path::PathBuf::from(store.folder().unwrap().describe());
         assert!(root.join("b").is_file() && store.get("b").await.unwrap() == "123");
         // a key has one body, wherever the one before was
         store.put("a", Bytes::from_static(b"12345678901")).await.unwrap();

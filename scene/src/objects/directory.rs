@@ -14,6 +14,8 @@ pub struct DirectoryObjects {
 
 /// No file of a name is larger: a reference is some 100 bytes.
 const LARGEST_NAME_FILE: u64 = 4096;
+/// Files that are being written begin with it; no object and no name does.
+const UNFINISHED: &str = ".writing-";
 
 impl DirectoryObjects {
     /// Opens the folder, which is made if it is not there.
@@ -35,6 +37,33 @@ impl DirectoryObjects {
     pub fn path_of(&self, hash: &ObjectHash) -> PathBuf {
         let hex = hash.to_string();
         self.root.join("objects").join(&hex[..2]).join(hex)
+    }
+
+    /// Deletes what writers that were killed left half-written; how many files and bytes. Nobody may be writing.
+    ///
+    /// # Errors
+    /// When the folder cannot be read, or a file cannot be deleted.
+    pub fn remove_unfinished(&self) -> Result<(u64, u64), ObjectError> {
+        let objects = self.root.join("objects");
+        let mut folders = vec![self.root.join("names")];
+        let list = |path: &Path| -> io::Result<Vec<fs::DirEntry>> { fs::read_dir(path)?.collect() };
+        for entry in list(&objects).map_err(|e| self.failed("list", &objects, e))? {
+            if entry.path().is_dir() {
+                folders.push(entry.path());
+            }
+        }
+        let (mut files, mut bytes) = (0, 0);
+        for folder in folders {
+            for entry in list(&folder).map_err(|e| self.failed("list", &folder, e))? {
+                if entry.file_name().to_string_lossy().starts_with(UNFINISHED) {
+                    let path = entry.path();
+                    let size = entry.metadata().map_or(0, |m| m.len());
+                    fs::remove_file(&path).map_err(|e| self.failed("delete", &path, e))?;
+                    (files, bytes) = (files + 1, bytes + size);
+                }
+            }
+        }
+        Ok((files, bytes))
     }
 
     fn describe(&self) -> String {
@@ -60,7 +89,7 @@ impl DirectoryObjects {
                 }
             }
             // dropped on an error, which deletes it
-            let mut file = tempfile::Builder::new().prefix(".writing-").tempfile_in(folder)?;
+            let mut file = tempfile::Builder::new().prefix(UNFINISHED).tempfile_in(folder)?;
             file.write_all(bytes)?;
             file.as_file().sync_all()?;
             file.persist(path).map_err(|e| e.error)?;

@@ -9,7 +9,7 @@ use crate::ImportError;
 use crate::description::{Description, Environment, Geometry, TextureKind};
 use crate::objects::ObjectHash;
 
-/// Fingerprint of a source: the hash of its description and, for every file it names (for a folder: every file in
+/// Fingerprint of a source: the hash of its description, but for what [`crate::manifest::Defaults`] holds of it, and, for every file it names (for a folder: every file in
 /// it), of path, size and time of last change in nanoseconds.
 ///
 /// Sizes and times, not contents, as `make` does: hashing contents would be a third read of a scene that may be
@@ -19,7 +19,17 @@ use crate::objects::ObjectHash;
 pub fn fingerprint(description: &Description) -> Result<ObjectHash, ImportError> {
     let mut hasher = blake3::Hasher::new();
     hasher.update(b"rayherd source\0");
-    hasher.update(&serde_json::to_vec(description).map_err(|e| ImportError::Limit {
+    // what the source says about camera, film and paths makes no difference to what is prepared, and follows options such as a size
+    let scene = Description {
+        camera: None,
+        size: None,
+        filter: None,
+        spp: None,
+        max_depth: None,
+        rr_depth: None,
+        ..description.clone()
+    };
+    hasher.update(&serde_json::to_vec(&scene).map_err(|e| ImportError::Limit {
         path: PathBuf::new(),
         message: format!("the description cannot be written down: {e}"),
     })?);
@@ -99,7 +109,10 @@ mod tests {
         fs::write(&path, b"three").unwrap();
         let second = fingerprint(&description).unwrap();
         assert_ne!(second, first);
+        description.size = Some([4, 4]);
         description.spp = Some(4);
+        assert_eq!(fingerprint(&description).unwrap(), second, "the picture is not the scene");
+        description.shapes[0].flip_normals = true;
         assert_ne!(fingerprint(&description).unwrap(), second);
         // a folder stands for its files
         description.shapes[0].geometry = Geometry::IsoSurface { path: folder.path().to_owned(), iso: 1.0 };

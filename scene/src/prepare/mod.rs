@@ -68,7 +68,7 @@ pub struct Prepared {
     pub manifest: Manifest,
     /// Name of the manifest in the store.
     pub reference: ObjectRef,
-    /// It was there already: nothing was read or written but the manifest.
+    /// It was there already: nothing was read or written but the manifest, which holds the camera and size of now.
     pub reused: bool,
     /// What it took.
     pub report: PrepareReport,
@@ -146,6 +146,13 @@ pub fn prepare(
     match Manifest::find(store, &print, settings) {
         Ok(Some((reference, manifest))) => {
             let report = PrepareReport::reused(reference.bytes);
+            let defaults = Defaults::of(description);
+            if manifest.defaults == defaults {
+                return Ok(Prepared { manifest, reference, reused: true, report });
+            }
+            // the same scene for another picture: a new list of the same objects
+            let manifest = Manifest { defaults, ..manifest };
+            let reference = manifest.store(store)?;
             return Ok(Prepared { manifest, reference, reused: true, report });
         }
         Ok(None) => {}

@@ -31,7 +31,7 @@ pub enum Fate {
     Duplicate,
     /// Its result never arrives.
     LoseResult,
-    /// A byte of a copy of an object that it made changes.
+    /// A byte of a copy of an object that it made changes, or of a block of the scene on some node's disk.
     Corrupt,
 }
 

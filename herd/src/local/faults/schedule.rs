@@ -56,7 +56,8 @@ impl<'e, 'a> Schedule<'e, 'a> {
 
     /// Starts what has waited long enough, and the first one when nothing else is under way.
     fn release(&self, state: &mut State) {
-        while !self.serial || state.doing.is_empty() {
+        // what runs reads what whoever is told of events deletes and copies: one after the other, too
+        while !self.serial || (state.doing.is_empty() && state.events.is_empty()) {
             let due = state.waiting.iter().position(|w| w.0 == 0);
             let next = due.or((state.doing.is_empty() && !state.waiting.is_empty()).then_some(0));
             let Some((_, mut launch, fate, identity)) = next.and_then(|at| state.waiting.remove(at)) else { return };
@@ -121,8 +122,13 @@ impl<'e, 'a> Schedule<'e, 'a> {
         self.nodes.delete(&groups.chain(film).collect::<Vec<_>>())
     }
 
-    /// A byte of one copy of something that an attempt made changes.
+    /// A byte of one copy of something that an attempt made changes, or of a block on some node's disk.
     fn corrupt(&self, what: u64, outputs: &Outputs) -> Result<(), JobError> {
+        if self.faults.pick(what.wrapping_add(3), 2) == 0 {
+            // each question is another one
+            let asked = std::cell::Cell::new(what.wrapping_add(4));
+            return self.nodes.corrupt_block(|n| self.faults.pick(asked.replace(asked.get().wrapping_add(1)), n));
+        }
         let groups = outputs.groups.iter().map(|g| (&g.key, &g.holders, g.bytes));
         let made: Vec<_> = groups.chain(outputs.film.iter().map(|f| (&f.key, &f.holders, f.bytes))).collect();
         if made.is_empty() {
@@ -165,6 +171,8 @@ impl Executor for Schedule<'_, '_> {
     }
     fn next(&self, wait: Duration) -> Result<Option<Event>, JobError> {
         let mut state = self.state.borrow_mut();
+        // all that was told so far has been dealt with
+        self.release(&mut state);
         let beaten = |f: &Finished, s: &State| s.doing.get(&(f.task, f.number)).is_some_and(|d| d.stop.is_set());
         while let Some(at) = state.held.iter().position(|f| beaten(f, &state)) {
             let finished = state.held.remove(at);
@@ -180,7 +188,9 @@ impl Executor for Schedule<'_, '_> {
                 None => {}
             }
         }
-        self.release(&mut state);
+        if !self.serial {
+            self.release(&mut state);
+        }
         Ok(state.events.pop_front())
     }
 }
