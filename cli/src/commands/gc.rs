@@ -15,9 +15,9 @@ use super::{print, size};
 use crate::fault::Mistake;
 use crate::store::{JOBS, S3Options, Store};
 
-/// Delete what nothing in a store names: losing attempts, consumed rays, objects of no scene, half-written files
+/// Delete what nothing in a store names: losing attempts, consumed rays, half-written files
 ///
-/// A job that is being written is refused. Do not prepare a scene into the store at the same time: its objects have no
+/// Objects of no scene go too. A job that is being written is refused. Do not prepare a scene into the store at the same time: its objects have no
 /// name until it is complete.
 #[derive(Args)]
 #[command(
