@@ -416,6 +416,15 @@ fn grid_data(
     out
 }
 
+/// Primitives in all splits that are built at one time: some 300 MiB of records, trees and blocks. A larger split is built alone, by all
+/// threads together.
+const AT_ONCE: u64 = 1 << 20;
+
+/// How many splits of at most so many primitives are built at one time: each holds its records and its tree.
+fn at_once(primitives: u64) -> usize {
+    usize::try_from(AT_ONCE / primitives.max(1)).unwrap_or(usize::MAX).clamp(1, rayon::current_num_threads())
+}
+
 /// Splits on their way into the store.
 struct Building<'a> {
     store: &'a CountingStore<'a>,
@@ -441,8 +450,7 @@ impl Building<'_> {
     fn source_splits(&mut self, ranges: &[Range<u64>], progress: &dyn PrepareProgress) -> Result<(), PrepareError> {
         progress.begin(Stage::Building, Some(ranges.len() as u64));
         let of_cell = self.groups.map_or(&[][..], |g| &g.of_cell);
-        // no more at a time than there are threads: each holds a split and its tree
-        for wave in ranges.chunks(rayon::current_num_threads()) {
+        for wave in ranges.chunks(at_once(ranges.iter().map(|r| r.end - r.start).max().unwrap_or(0))) {
             let first = self.splits.len() as u32;
             let work = |(split, range): (u32, &Range<u64>)| -> Result<_, PrepareError> {
                 let records = self.spool.range(range).map_err(|e| self.spool_error(e))?;

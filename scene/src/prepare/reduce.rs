@@ -5,7 +5,7 @@ use rayon::prelude::*;
 use super::incidence::ABSENT;
 use super::progress::{PrepareProgress, Stage};
 use super::records::Records;
-use super::{Building, PrepareError, build_split};
+use super::{Building, PrepareError, at_once, build_split};
 
 impl Building<'_> {
     /// Joins groups in their order while their distinct primitives are at most `capacity`, builds the splits and hands the
@@ -25,7 +25,7 @@ impl Building<'_> {
             if filling.len() > 0 && filling.union_len(&records) as u64 > capacity {
                 full.push(std::mem::take(&mut filling));
                 next += 1;
-                if full.len() == rayon::current_num_threads() {
+                if full.len() == at_once(capacity) {
                     self.copied_splits(&mut full)?;
                 }
             }
