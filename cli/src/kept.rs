@@ -96,7 +96,10 @@ pub fn check_resumed(store: &Store, place: &str, pictures: &[(String, About)]) -
             nearest = Some((found, kept));
         }
     }
-    let Some((differs, kept)) = nearest else { return Ok(()) };
+    let Some((differs, kept)) = nearest else {
+        tracing::warn!("{place} holds no job of this scene to go on with: it is begun");
+        return Ok(());
+    };
     let differs = if differs.is_empty() { "how it is written down".to_owned() } else { differs.join(", ") };
     Err(Mistake(format!(
         "{place} holds no job of this picture to go on with; the nearest that it holds, of {}, differs in {differs}: undo that to go on \
