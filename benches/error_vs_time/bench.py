@@ -9,15 +9,14 @@ import csv
 import datetime
 import json
 import math
-import os
 import platform
-import subprocess
 import sys
 from pathlib import Path
 
 import numpy as np
 
 import scenes
+from measure import run
 
 SIZE = 256
 # where peers are compared at equal error
@@ -65,18 +64,6 @@ class Renderer:
 
 
 RENDERERS = [Renderer("rayherd", None), Renderer("llvm", "llvm_ad_rgb"), Renderer("scalar", "scalar_rgb")]
-
-
-def run(command: list) -> tuple:
-    start = datetime.datetime.now()
-    child = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
-    text, error = child.stdout.read(), child.stderr.read()
-    _, status, usage = os.wait4(child.pid, 0)
-    wall = (datetime.datetime.now() - start).total_seconds()
-    child.returncode = os.waitstatus_to_exitcode(status)
-    if child.returncode:
-        raise SystemExit(f"{' '.join(map(str, command))}\n{error.decode()}")
-    return usage.ru_utime + usage.ru_stime, wall, text.decode()
 
 
 def read_exr(path: Path) -> np.ndarray:

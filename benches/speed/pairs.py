@@ -2,15 +2,14 @@
 import argparse
 import csv
 import datetime
-import os
 import platform
-import subprocess
 import sys
 from pathlib import Path
 
 import numpy as np
 
 import scenes
+from measure import interval, run
 
 SPP = {"cornell": 1024, "gyroid": 256, "veach-mis": 256}
 
@@ -23,30 +22,6 @@ scene = mi.load_file(xml, **dict(kv.split('=') for kv in sys.argv[4:]))
 dr.eval(mi.render(scene, spp=spp, seed=seed))
 dr.sync_thread()
 """
-
-
-def cpu(command: list) -> tuple:
-    """CPU seconds (user + system, all threads) and wall seconds of a whole process."""
-    start = datetime.datetime.now()
-    child = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
-    error = child.stderr.read()
-    _, status, usage = os.wait4(child.pid, 0)
-    child.returncode = os.waitstatus_to_exitcode(status)
-    if child.returncode:
-        raise SystemExit(f"{' '.join(map(str, command))}\n{error.decode()}")
-    return usage.ru_utime + usage.ru_stime, (datetime.datetime.now() - start).total_seconds()
-
-
-def interval(ratios: list) -> tuple:
-    """Order statistics that hold the median with at least 95 % (binomial)."""
-    r = sorted(ratios)
-    n = len(r)
-    tail, k, p = 0.0, 0, 0.5 ** n
-    while k < n // 2 and tail + p <= 0.025:
-        tail += p
-        k += 1
-        p = p * (n - k + 1) / k
-    return r[max(k - 1, 0)], r[min(n - k, n - 1)]
 
 
 def main() -> None:
@@ -71,9 +46,9 @@ def main() -> None:
         ours = [a.rayherd, "render", str(xml), "--size", f"{a.size}x{a.size}", "--spp", str(spp), "--max-depth", str(a.max_depth),
                 "-o", str(a.work / "bench.exr")]
         theirs = [sys.executable, "-c", MITSUBA, str(xml), str(spp), "1"] + [f"{k}={v}" for k, v in values.items()]
-        cpu(theirs)  # fills Mitsuba's kernel cache
+        run(theirs)  # fills Mitsuba's kernel cache
         for i in range(a.pairs):
-            (co, wo), (ct, wt) = cpu(ours), cpu(theirs)
+            (co, wo, _), (ct, wt, _) = run(ours), run(theirs)
             rows.append([name, spp, i, co, wo, ct, wt, co / ct])
             print(f"{name} pair {i}: rayherd {co:.2f} CPU-s, mitsuba {ct:.2f} CPU-s, ratio {co / ct:.3f}", flush=True)
         ratios = [r[7] for r in rows if r[0] == name]

@@ -2,27 +2,31 @@
 //!
 //! `kernel rays DIR` makes the ray sets of the scene `DIR/scene.tri` (nine little-endian f32 a triangle, framed like the
 //! gyroid of shared/peers): `primary.rays`, `bounce1.rays`, `bounce2.rays`, `shadow.rays`, 32 bytes a ray.
-//! `kernel DIR [REPETITIONS] [BLOCKS]` builds the scene as that many blocks in source order and traces them with every
-//! kernel this processor has, interleaved. Figures are medians of thread CPU time.
+//! `kernel DIR [REPETITIONS] [BLOCKS] [auto]` builds the scene as that many blocks in source order and traces them with every
+//! kernel this processor has, interleaved, or with the fastest alone. Figures are medians and bests of thread CPU time.
 
 use std::path::Path;
 
 use anyhow::{Context, bail, ensure};
-use rayherd_benches::{median, thread_cpu};
+use rayherd_benches::{median, process_cpu, thread_cpu};
 use rayherd_render::bvh::{Forest, Fork, Kernel, Tracer, build_block};
 use rayherd_render::ray::{Hit, PrimId, Ray};
 use rayherd_render::world::Primitive;
 
 const SETS: [&str; 4] = ["primary", "bounce1", "bounce2", "shadow"];
+const KERNELS: [Kernel; 3] = [Kernel::Avx512, Kernel::Avx2, Kernel::Scalar];
 
 fn main() -> anyhow::Result<()> {
     let args: Vec<String> = std::env::args().skip(1).collect();
     match args.iter().map(String::as_str).collect::<Vec<_>>()[..] {
         ["rays", dir] => make_rays(Path::new(dir)),
-        [dir] => measure(Path::new(dir), 5, 1),
-        [dir, repetitions] => measure(Path::new(dir), repetitions.parse()?, 1),
-        [dir, repetitions, blocks] => measure(Path::new(dir), repetitions.parse()?, blocks.parse()?),
-        _ => bail!("usage: kernel rays DIR | kernel DIR [REPETITIONS] [BLOCKS]"),
+        [dir] => measure(Path::new(dir), 5, 1, &KERNELS),
+        [dir, repetitions] => measure(Path::new(dir), repetitions.parse()?, 1, &KERNELS),
+        [dir, repetitions, blocks] => measure(Path::new(dir), repetitions.parse()?, blocks.parse()?, &KERNELS),
+        [dir, repetitions, blocks, "auto"] => {
+            measure(Path::new(dir), repetitions.parse()?, blocks.parse()?, &[Kernel::Auto])
+        }
+        _ => bail!("usage: kernel rays DIR | kernel DIR [REPETITIONS] [BLOCKS] [auto]"),
     }
 }
 
@@ -68,20 +72,9 @@ fn load(dir: &Path, blocks: usize) -> anyhow::Result<Forest> {
     Ok(forest)
 }
 
-/// CPU time of all threads so far, seconds.
-fn process_cpu() -> anyhow::Result<f64> {
-    let mut sum = 0.0;
-    for task in std::fs::read_dir("/proc/self/task")? {
-        let text = std::fs::read_to_string(task?.path().join("schedstat"))?;
-        sum += text.split(' ').next().context("no figures")?.parse::<f64>()? * 1e-9;
-    }
-    Ok(sum)
-}
-
-fn measure(dir: &Path, repetitions: usize, blocks: usize) -> anyhow::Result<()> {
+fn measure(dir: &Path, repetitions: usize, blocks: usize, kernels: &[Kernel]) -> anyhow::Result<()> {
     let forest = load(dir, blocks)?;
-    let mut tracers: Vec<Tracer> =
-        [Kernel::Avx512, Kernel::Avx2, Kernel::Scalar].into_iter().filter_map(|k| Tracer::new(k).ok()).collect();
+    let mut tracers: Vec<Tracer> = kernels.iter().filter_map(|&k| Tracer::new(k).ok()).collect();
     for set in SETS {
         let rays: Vec<Ray> = read(&dir.join(format!("{set}.rays")))?;
         let is_shadow = set == "shadow";

@@ -1,0 +1,70 @@
+"""Median over interleaved pairs of our rays per second over the prototype's and Embree's (fast mode), with its 95 % interval."""
+import argparse
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+from measure import interval
+
+GRID = {"1M": 148, "8M": 419}
+SETS = ["primary", "bounce1", "bounce2", "shadow"]
+# rays in flight, prefetch, nearest child first; any-hit is faster without the order
+CLOSEST, ANY = "32:ps:", "32:p:"
+
+
+def output(command: list) -> str:
+    return subprocess.run([str(c) for c in command], check=True, capture_output=True, text=True).stdout
+
+
+def ours(kernel: Path, folder: Path, repetitions: int) -> dict:
+    out = output([kernel, folder, repetitions, 1, "auto"])
+    return {m[1]: float(m[2]) for m in re.finditer(r"^(\w+) +Avx\w+ +median +[\d.]+ best +([\d.]+)", out, re.M)}
+
+
+def theirs(prototype: Path, folder: Path, repetitions: int) -> tuple:
+    out = output([prototype, folder, "-r", repetitions, "-v", f"{CLOSEST},{ANY}"])
+    found, embree, name = {}, {}, ""
+    for line in out.splitlines():
+        if m := re.match(r"(\w+) +embree ([\d.]+)", line):
+            name = m[1]
+            embree[name] = float(m[2])
+        elif m := re.match(r" +(\S+) +([\d.]+) Mrays/s", line):
+            if m[1] == (ANY if name == "shadow" else CLOSEST):
+                found[name] = float(m[2])
+    return found, embree
+
+
+def main() -> None:
+    p = argparse.ArgumentParser(description=__doc__)
+    p.add_argument("--kernel", type=Path, required=True)
+    p.add_argument("--prototype", type=Path, required=True)
+    p.add_argument("--shared", type=Path, required=True)
+    p.add_argument("--work", type=Path, required=True)
+    p.add_argument("--pairs", type=int, default=10)
+    p.add_argument("--repetitions", type=int, default=3)
+    p.add_argument("--triangles", default="8M,1M")
+    a = p.parse_args()
+    prototype = next(f for f in a.prototype.iterdir() if f.is_file() and f.stat().st_mode & 0o111 and f.suffix == "")
+    for size in a.triangles.split(","):
+        work = a.work.resolve() / size
+        folder = work / "scenes"
+        if not (folder / "shadow.rays").exists():
+            work.mkdir(parents=True, exist_ok=True)
+            subprocess.run([sys.executable, a.shared.resolve() / "peers/make_scene.py", str(GRID[size])], cwd=work, check=True, stdout=subprocess.DEVNULL)
+            output([a.kernel, "rays", folder])
+        over = {(s, peer): [] for s in SETS for peer in ("prototype", "embree")}
+        for pair in range(a.pairs):
+            mine = ours(a.kernel, folder, a.repetitions)
+            proto, embree = theirs(prototype, folder, a.repetitions)
+            for s in SETS:
+                over[s, "prototype"].append(mine[s] / proto[s])
+                over[s, "embree"].append(mine[s] / embree[s])
+            print(f"{size} pair {pair}: " + ", ".join(f"{s} {mine[s]:.2f} / {proto[s]:.2f} / {embree[s]:.2f}" for s in SETS), flush=True)
+        for (s, peer), ratios in over.items():
+            lo, hi = interval(ratios)
+            print(f"{size} {s} over {peer}: median {sorted(ratios)[len(ratios) // 2]:.3f}, 95 % interval {lo:.3f} to {hi:.3f}", flush=True)
+
+
+if __name__ == "__main__":
+    main()
