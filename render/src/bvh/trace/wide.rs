@@ -221,13 +221,13 @@ unsafe fn rounds<I: InstructionSet, const ANY: bool, D: FnMut(usize, &mut State)
                 if ANY {
                     // which one does not matter: the ray is done
                     let state = &mut *states.add(lane);
-                    let is_hit = triangles::<I>(arena, state).0 != 0;
+                    let is_hit = triangles::<I, ANY>(arena, state).0 != 0;
                     state.prim = if is_hit { 0 } else { state.prim };
                     state.top = if is_hit { BASE as u32 } else { state.top };
                     continue;
                 }
                 let f = &mut *found.add(founds);
-                let (mask, [t, u, v]) = triangles::<I>(arena, &*states.add(lane));
+                let (mask, [t, u, v]) = triangles::<I, ANY>(arena, &*states.add(lane));
                 _mm256_store_ps(f.t.as_mut_ptr(), t);
                 _mm256_store_ps(f.u.as_mut_ptr(), u);
                 _mm256_store_ps(f.v.as_mut_ptr(), v);
@@ -354,13 +354,13 @@ unsafe fn boxes<I: InstructionSet>(node: *const u8, state: &State) -> (u32, __m2
     }
 }
 
-/// Tests the triangles of the leaf that a ray is at, as [`super::triangle::intersect`] does: mask of hits; t and the barycentrics of
+/// Tests the triangles of the leaf that a ray is at (with `ANY`, only the mask is an answer), as [`super::triangle::intersect`] does: mask of hits; t and the barycentrics of
 /// the second and third vertex.
 ///
 /// # Safety
 /// The ray's current reference is a leaf in `arena`; features of `I` are enabled.
 #[inline(always)]
-unsafe fn triangles<I: InstructionSet>(arena: *const u8, state: &State) -> (u32, [__m256; 3]) {
+unsafe fn triangles<I: InstructionSet, const ANY: bool>(arena: *const u8, state: &State) -> (u32, [__m256; 3]) {
     // SAFETY: rows of n values lie in the leaf; eight are read of each, at most 28 bytes past the leaf's end.
     unsafe {
         let leaf = arena.add(offset(state.current)).cast::<f32>();
@@ -392,6 +392,10 @@ unsafe fn triangles<I: InstructionSet>(arena: *const u8, state: &State) -> (u32,
         let least = _mm256_min_ps(_mm256_min_ps(u, v), w);
         let most = _mm256_max_ps(_mm256_max_ps(u, v), w);
         let inside = (I::compare::<_CMP_GE_OQ>(least, zero) | I::compare::<_CMP_LE_OQ>(most, zero)) & live;
+        // most leaf visits of a shadow ray end here; where hits are wanted the branch is hard to foretell and costs more than it saves
+        if ANY && inside == 0 {
+            return (0, [zero; 3]);
+        }
         let sum = _mm256_add_ps(_mm256_add_ps(u, v), w);
         let scale = _mm256_div_ps(all(1.0), sum);
         let mut barycentrics = [_mm256_mul_ps(u, scale), _mm256_mul_ps(v, scale), _mm256_mul_ps(w, scale)];
