@@ -3,18 +3,24 @@
 use std::path::{Path, PathBuf};
 
 use anyhow::Context;
-use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
+use indicatif::{ProgressBar, ProgressDrawTarget, ProgressState, ProgressStyle};
 use rayherd_api::RenderJobSpec;
 use rayherd_herd::job::spec::{import_options, prepare_settings};
 use rayherd_scene::import::{DescriptionSource, StreamOptions, import};
 use rayherd_scene::objects::ObjectStore;
-use rayherd_scene::prepare::{PrepareProgress, Prepared, SpoolSettings, Stage, prepare};
+use rayherd_scene::prepare::{PrepareProgress, Prepared, SpoolSettings, Stage, prepare, source_files};
 
 use crate::log::bars;
+use crate::output::distinct;
+use crate::progress::si;
 
-/// Imports and prepares the scene of a job that was checked; also how many bytes of vertices went to temporary files.
-pub fn open(spec: &RenderJobSpec, objects: &dyn ObjectStore) -> anyhow::Result<(Prepared, u64)> {
-    let description = import(Path::new(&spec.scene.source), &import_options(spec))?;
+/// Imports and prepares the scene of a job that was checked; also how many bytes of vertices went to temporary files. Refuses when one of
+/// `outputs`, which are to be written, is a file of the scene.
+pub fn open(spec: &RenderJobSpec, objects: &dyn ObjectStore, outputs: &[PathBuf]) -> anyhow::Result<(Prepared, u64)> {
+    let scene = Path::new(&spec.scene.source);
+    distinct::check_inputs(outputs, [scene])?;
+    let description = import(scene, &import_options(spec))?;
+    distinct::check_inputs(outputs, source_files(&description))?;
     for s in &description.substitutions {
         tracing::warn!("{}: {} is not supported; in its place: {}", s.place, s.what, s.stand_in);
     }
@@ -54,10 +60,14 @@ impl PrepareProgress for StageBar {
         tracing::info!("preparing: {what}");
         let template = match total {
             Some(_) => format!("{what} {{wide_bar:.cyan/blue}} {{human_pos}} of {{human_len}} {unit}"),
-            None => format!("{what} {{human_pos}} {unit} {{per_sec}}"),
+            None => format!("{what} {{human_pos}} {unit} {{rate}}"),
         };
         if let Ok(style) = ProgressStyle::with_template(&template) {
-            self.0.set_style(style);
+            let rate = |state: &ProgressState, out: &mut dyn std::fmt::Write| {
+                // what is shown of a bar cannot fail the work
+                let _ = write!(out, "{}/s", si(state.per_sec()));
+            };
+            self.0.set_style(style.with_key("rate", rate));
         }
         self.0.reset();
         if let Some(total) = total {

@@ -63,8 +63,12 @@ impl Store {
         if s3.s3_endpoint.is_some() {
             return Err(Mistake(format!("--s3-endpoint is for a store s3://bucket/prefix, not for {address}")).into());
         }
-        let blocks = Arc::new(DirectoryStore::open(address)?);
-        let objects = Arc::new(DirectoryObjects::open(address)?);
+        if address.is_empty() || address.contains("://") {
+            return Err(Mistake(format!("{address:?} is no store: name a folder, or s3://bucket/prefix")).into());
+        }
+        let cannot = || format!("cannot open the store {address}: name a folder that can be written to");
+        let blocks = Arc::new(DirectoryStore::open(address).with_context(cannot)?);
+        let objects = Arc::new(DirectoryObjects::open(address).with_context(cannot)?);
         Ok(Store { blocks, objects, runtime })
     }
 

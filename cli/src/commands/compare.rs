@@ -14,7 +14,7 @@ use serde::Serialize;
 use super::print;
 use crate::fault::Mistake;
 use crate::output::exr_file::{self, Channels};
-use crate::output::{png_file, replace};
+use crate::output::{distinct, png_file, replace};
 
 /// Compare two EXR pictures, B being the reference; prints JSON
 ///
@@ -57,6 +57,9 @@ pub struct Arguments {
 
 /// Compares, prints, and answers by the exit status.
 pub fn run(arguments: &Arguments) -> anyhow::Result<ExitCode> {
+    if let Some(path) = &arguments.diff {
+        distinct::check_inputs(std::slice::from_ref(path), [arguments.a.as_path(), arguments.b.as_path()])?;
+    }
     let (a, b) = (exr_file::read(&arguments.a)?, exr_file::read(&arguments.b)?);
     check_same_shape(&a, &b, arguments)?;
     let comparison = Comparison::of(&a, &b, same_bytes(&arguments.a, &arguments.b)?);

@@ -36,12 +36,17 @@ pub fn run(arguments: &Arguments) -> anyhow::Result<ExitCode> {
     let nothing = || Mistake(format!("{place} holds nothing of Rayherd's, so nothing of it is deleted: name a store"));
     // a folder that is no store must not become one by looking
     let folder = Path::new(place);
-    if !place.starts_with("s3://") && folder.is_dir() && !folder.join("names").is_dir() && !folder.join(JOBS).is_dir() {
+    let holds = |name: &str| folder.join(name).is_dir();
+    if !place.starts_with("s3://") && folder.is_dir() && !["names", "objects", JOBS].into_iter().any(holds) {
         return Err(nothing().into());
     }
     let store = Store::existing(place, &arguments.s3)?;
     let jobs = jobs(&store)?;
-    if jobs.is_empty() && !store.objects.names()?.iter().any(|n| n.starts_with("scene-")) {
+    // a first preparing that was killed leaves objects without a name
+    let has_objects = || -> anyhow::Result<bool> {
+        Ok(store.wait(store.blocks.list("objects/"))?.iter().any(|(key, _)| is_object_key(key)))
+    };
+    if jobs.is_empty() && !store.objects.names()?.iter().any(|n| n.starts_with("scene-")) && !has_objects()? {
         return Err(nothing().into());
     }
     let mut total = Collected::default();

@@ -46,7 +46,7 @@ pub fn run(arguments: &Arguments) -> anyhow::Result<ExitCode> {
     options::check(&RenderJob::new(spec.clone()), None)?;
 
     let store = Store::open(&arguments.store, &arguments.s3)?;
-    let (prepared, _) = source::open(&spec, store.objects.as_ref())?;
+    let (prepared, _) = source::open(&spec, store.objects.as_ref(), &[])?;
     let m = &prepared.manifest;
     let copied = m.splits.iter().filter(|s| s.copied).count();
     let done = if prepared.reused { "was prepared already: nothing to do" } else { "is prepared" };

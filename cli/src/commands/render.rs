@@ -22,7 +22,7 @@ use crate::interrupt::{self, Heeding};
 use crate::job_file::read_job;
 use crate::kept::{self, About};
 use crate::options::{self, CutOptions, SceneOptions, set};
-use crate::output::{png_file, replace};
+use crate::output::{distinct, png_file, replace};
 use crate::progress::{Display, si};
 use crate::run_options::RunOptions;
 use crate::source;
@@ -114,17 +114,26 @@ pub fn run(arguments: &Arguments) -> anyhow::Result<ExitCode> {
     use_threads(settings.threads)?;
     let files = frames::files(&job);
     frames::check_files(&files)?;
-    let pictures = files.iter().flat_map(|exr| [exr.clone(), exr.with_extension("png")]);
-    for path in pictures.chain(arguments.preview.clone()).chain(arguments.report.clone()) {
-        replace::probe(&path)?;
+    let mut outputs: Vec<PathBuf> = files.iter().flat_map(|exr| [exr.clone(), exr.with_extension("png")]).collect();
+    outputs.iter().try_for_each(|path| replace::probe(path, "-o"))?;
+    for (path, flag) in [(&arguments.preview, "--preview"), (&arguments.report, "--report")] {
+        if let Some(path) = path {
+            replace::probe(path, flag)?;
+            // a preview becomes the picture, if it is to
+            if !(flag == "--preview" && outputs.contains(path) && path.extension().is_some_and(|e| e == "png")) {
+                outputs.push(path.clone());
+            }
+        }
     }
+    distinct::check_outputs(&outputs)?;
+    distinct::check_inputs(&outputs, arguments.file.as_deref())?;
 
     let keep = &arguments.keep;
     let store = keep.store.as_ref().map(|address| Store::open(address, &keep.s3)).transpose()?;
     let temporary = if store.is_none() { Some(Temporary::new(OBJECTS_IN_MEMORY)?) } else { None };
     let objects = store.as_ref().map(|s| s.objects.clone()).or_else(|| temporary.as_ref().map(|t| t.objects.clone()));
     let objects = objects.context("no place for the prepared scene")?;
-    let (prepared, vertices_spilled) = source::open(&job.spec, objects.as_ref())?;
+    let (prepared, vertices_spilled) = source::open(&job.spec, objects.as_ref(), &outputs)?;
     let shots = frames::shots(&job, &prepared.manifest)?;
     let scene = PreparedScene::open(prepared.manifest.clone(), objects)?;
     let sampling = Sampling {

@@ -52,7 +52,7 @@ pub fn run(arguments: &Arguments) -> anyhow::Result<ExitCode> {
     options::check(&job, None)?;
     let temporary = Temporary::new(OBJECTS_IN_MEMORY)?;
     let objects = temporary.objects.clone();
-    let (prepared, _) = source::open(&job.spec, objects.as_ref())?;
+    let (prepared, _) = source::open(&job.spec, objects.as_ref(), &[])?;
     let frame = frames::frame(&job, &prepared.manifest, job.spec.image.cameras.first())?;
     let ([x, y], [width, height]) = (arguments.pixel, frame.size);
     if x >= width || y >= height {

@@ -5,12 +5,13 @@ use std::process::ExitCode;
 
 use clap::{Args, Subcommand};
 use rayherd_scene::import::{DescriptionSource, ImportOptions, StreamOptions, import_surface};
+use rayherd_scene::prepare::source_files;
 use rayherd_scene::record::RecordSource;
 use rayherd_scene::tools::{self, ToolError, Written};
 
 use super::{print, size};
 use crate::options::numbers;
-use crate::output::replace;
+use crate::output::{distinct, replace};
 
 /// Make a larger or worse-ordered scene out of one, as binary PLY: triangles only
 #[derive(Args)]
@@ -86,9 +87,11 @@ fn write(
     files: &Files,
     tool: impl FnOnce(&dyn RecordSource, &Path) -> Result<Written, ToolError>,
 ) -> anyhow::Result<Written> {
-    replace::probe(&files.output)?;
+    replace::probe_file(&files.output, "-o")?;
+    distinct::check_inputs(std::slice::from_ref(&files.output), [files.scene.as_path()])?;
     let options = ImportOptions { iso: files.iso, ..ImportOptions::default() };
     let description = import_surface(&files.scene, &options)?;
+    distinct::check_inputs(std::slice::from_ref(&files.output), source_files(&description))?;
     Ok(tool(&DescriptionSource::new(&description, StreamOptions::default()), &files.output)?)
 }
 

@@ -8,8 +8,8 @@ use anyhow::{Context, anyhow};
 
 use crate::fault::Mistake;
 
-/// Whether `path` can be replaced, found out before any work is done: a file is made beside it and removed again.
-pub fn probe(path: &Path) -> anyhow::Result<()> {
+/// Whether `path`, which `flag` names, can be replaced, found out before any work is done: a file is made beside it and removed again.
+pub fn probe(path: &Path, flag: &str) -> anyhow::Result<()> {
     if path.is_dir() {
         return Err(Mistake(format!("cannot write {}: it is a folder; name a file", path.display())).into());
     }
@@ -18,7 +18,15 @@ pub fn probe(path: &Path) -> anyhow::Result<()> {
     }
     let temporary = beside(path);
     let made = create(&temporary).and_then(|_| fs::remove_file(&temporary));
-    made.map_err(|e| Mistake(format!("cannot write {}: {e}; choose another place with -o", path.display())).into())
+    made.map_err(|e| Mistake(format!("cannot write {}: {e}; choose another place with {flag}", path.display())).into())
+}
+
+/// [`probe`] for a file that is written piece by piece and then named: nothing else can be.
+pub fn probe_file(path: &Path, flag: &str) -> anyhow::Result<()> {
+    if is_device(path) {
+        return Err(Mistake(format!("cannot write {}: it is no file; name one with {flag}", path.display())).into());
+    }
+    probe(path, flag)
 }
 
 /// Whether something is there that takes bytes but is no file: a device, a pipe, a socket. It must not be replaced by one.
@@ -92,7 +100,7 @@ mod tests {
             eprintln!("this system has no /dev/full: not tested");
             return;
         }
-        probe(device).unwrap();
+        probe(device, "-o").unwrap();
         assert_eq!(replace(device, b"x").unwrap_err().kind(), io::ErrorKind::StorageFull);
         assert!(is_device(device));
         let folder = tempfile::tempdir().unwrap();
@@ -113,7 +121,7 @@ mod tests {
     fn a_file_is_replaced_whole_and_nothing_else_is_left() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("a.exr");
-        probe(&path).unwrap();
+        probe(&path, "-o").unwrap();
         assert_eq!(names(folder.path()), [""; 0]);
         replace(&path, b"one").unwrap();
         replace(&path, b"two").unwrap();
@@ -125,8 +133,8 @@ mod tests {
     fn what_cannot_be_written_is_found_before_and_kept_after() {
         let folder = tempfile::tempdir().unwrap();
         let missing = folder.path().join("none/a.exr");
-        assert!(probe(&missing).unwrap_err().to_string().contains("cannot write"));
-        assert!(probe(folder.path()).unwrap_err().to_string().contains("it is a folder"));
+        assert!(probe(&missing, "--report").unwrap_err().to_string().contains("another place with --report"));
+        assert!(probe(folder.path(), "-o").unwrap_err().to_string().contains("it is a folder"));
 
         let fallback = folder.path().to_path_buf();
         let error = replace_or_keep_in(&missing, b"film", &[missing.clone(), fallback]).unwrap_err().to_string();

@@ -9,12 +9,11 @@ use std::sync::Arc;
 
 use bytes::Bytes as Body;
 use rayherd_scene::objects::{ObjectHash, ObjectRef, ObjectStore};
-use tempfile::TempDir;
 use tokio::sync::Mutex;
 
 use crate::job::JobError;
 use crate::report::{Bytes, Kind, Op, Place, Stage};
-use crate::store::{BlockStore, Counters, DirectoryStore, Replicated, StoreError, temporary_folder};
+use crate::store::{BlockStore, Counters, DirectoryStore, Replicated, StoreError, TemporaryFolder};
 
 /// Locks of blocks that are being copied; more than there are threads.
 const LOCKS: usize = 64;
@@ -25,13 +24,13 @@ pub struct Disks {
     /// Keys of the blocks that were copied to their nodes.
     placed: Vec<Mutex<BTreeSet<String>>>,
     #[cfg_attr(not(test), expect(dead_code, reason = "it goes when this is dropped"))]
-    folder: TempDir,
+    folder: TemporaryFolder,
 }
 
 impl Disks {
     /// Empty folders for so many nodes; each block will lie on `replicas` of them.
     pub fn new(nodes: usize, replicas: usize) -> Result<Self, StoreError> {
-        let folder = temporary_folder("rayherd-nodes-")?;
+        let folder = TemporaryFolder::new("nodes-")?;
         let open = |n: usize| -> Result<Arc<dyn BlockStore>, StoreError> {
             Ok(Arc::new(DirectoryStore::open_unsynced(folder.path().join(n.to_string()))?))
         };

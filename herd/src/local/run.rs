@@ -38,7 +38,6 @@ pub fn render_local(
     progress: &dyn Progress,
 ) -> Result<JobOutcome, JobError> {
     check(scene, frame, sampling, settings)?;
-    // a folder that outlives the process by a signal is the system's to clear
     let spilling = settings.commits.is_none().then(|| Arc::new(Spilling::new(AT_REST_IN_MEMORY, |_| ())));
     let store = match (&settings.commits, &spilling) {
         (Some(commits), _) => commits.store.clone(),
@@ -69,6 +68,10 @@ pub fn render_local(
         return Ok(made);
     };
     let nodes = &shared.nodes;
+    if commits.takeover {
+        // what cannot be done must not cost somebody's run
+        may_go_on(&shared, commits.resume, sampling.spp)?;
+    }
     let owner = Ownership::take(nodes.store().clone(), commits.takeover);
     let owner = Arc::new(nodes.wait(owner)?);
     let result = resume(&shared, &owner, commits.resume, sampling.spp)
@@ -80,6 +83,30 @@ pub fn render_local(
     result
 }
 
+/// Refuses what [`resume`] would refuse, as far as it is known without reading pictures.
+fn may_go_on(shared: &Shared, may_resume: bool, spp: u32) -> Result<(), JobError> {
+    let place = shared.nodes.store().describe();
+    let records = shared.nodes.wait(journal::read(shared.nodes.store().as_ref()))?;
+    if !may_resume && !records.is_empty() {
+        return Err(holds_a_job(&place));
+    }
+    let chain = journal::newest_of(&shared.scene.image_name(shared.frame)?, records)?;
+    let reach = chain.records.iter().rev().find_map(|(_, r)| r.snapshot.as_ref()).map_or(0, |s| s.done.reach());
+    enough(&place, reach, spp)
+}
+
+fn holds_a_job(place: &str) -> JobError {
+    JobError::Settings(format!("{place} holds a job already: resume it, or use another store"))
+}
+
+fn enough(place: &str, reach: u32, spp: u32) -> Result<(), JobError> {
+    if reach <= spp {
+        return Ok(());
+    }
+    let message = format!("{place} holds {reach} samples per pixel, {spp} were asked for: ask for at least as many");
+    Err(JobError::Settings(message))
+}
+
 /// Reads the state to go on from.
 fn resume<'n, 'a>(
     shared: &'n Shared<'a>,
@@ -89,18 +116,12 @@ fn resume<'n, 'a>(
 ) -> Result<Start<MemoryFilm<'n, 'a>>, JobError> {
     let (nodes, size) = (&shared.nodes, shared.frame.size);
     let place = nodes.store().describe();
-    let refuse = |message: String| Err(JobError::Settings(message));
     if !may_resume && !nodes.wait(nodes.store().list("records/"))?.is_empty() {
-        return refuse(format!("{place} holds a job already: resume it, or use another store"));
+        return Err(holds_a_job(&place));
     }
     let image = shared.scene.image_name(shared.frame)?;
     let resumed = journal::resume(nodes, &image, &journal::scope(shared.scene, shared.frame), size)?;
-    let reach = resumed.ledger.done().reach();
-    if reach > spp {
-        return refuse(format!(
-            "{place} holds {reach} samples per pixel, {spp} were asked for: ask for at least as many"
-        ));
-    }
+    enough(&place, resumed.ledger.done().reach(), spp)?;
     let (settled, settled_film) = resumed.settled;
     Ok(Start {
         ledger: resumed.ledger,

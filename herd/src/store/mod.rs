@@ -15,6 +15,7 @@ mod s3;
 #[cfg(any(test, feature = "testing"))]
 pub mod s3_server;
 mod spilling;
+mod temporary;
 
 use async_trait::async_trait;
 use bytes::Bytes;
@@ -29,7 +30,8 @@ pub use prefixed::Prefixed;
 pub use replicated::{NodeView, Replicated, ReplicationCounts, Verify};
 pub use retrying::{RetryPolicy, Retrying};
 pub use s3::{S3Credentials, S3Settings, S3Store};
-pub use spilling::{Spilling, temporary_folder};
+pub use spilling::Spilling;
+pub use temporary::TemporaryFolder;
 
 /// A flat space of named, immutable objects.
 ///

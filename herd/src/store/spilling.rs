@@ -5,15 +5,14 @@ use std::sync::{Arc, Mutex, PoisonError};
 
 use async_trait::async_trait;
 use bytes::Bytes;
-use tempfile::TempDir;
 
-use super::{BlockStore, Counters, Counting, DirectoryStore, MemoryStore, StoreError};
+use super::{BlockStore, Counters, Counting, DirectoryStore, MemoryStore, StoreError, TemporaryFolder};
 use crate::report::{Op, Place, Stage};
 
 /// Objects that vanish with this value. The folder is made when the first object does not fit into memory.
 pub struct Spilling {
     memory: MemoryStore,
-    folder: Mutex<Option<(TempDir, Arc<Counting>)>>,
+    folder: Mutex<Option<(TemporaryFolder, Arc<Counting>)>>,
     made: fn(&Path),
     counters: Counters,
 }
@@ -39,21 +38,13 @@ impl Spilling {
         if let Some((_, store)) = folder.as_ref() {
             return Ok(store.clone());
         }
-        let made = temporary_folder("rayherd-")?;
+        let made = TemporaryFolder::new("")?;
         (self.made)(made.path());
         let store = Arc::new(DirectoryStore::open_unsynced(made.path())?);
         let store = Arc::new(Counting::new(store, self.counters.clone(), Stage::Trace, Place::Local));
         *folder = Some((made, store.clone()));
         Ok(store)
     }
-}
-
-/// A folder in the system's place for such (`TMPDIR`) that goes with the value.
-pub fn temporary_folder(prefix: &str) -> Result<TempDir, StoreError> {
-    tempfile::Builder::new().prefix(prefix).tempdir().map_err(|e| StoreError::Misconfigured {
-        store: std::env::temp_dir().display().to_string(),
-        message: format!("cannot make a temporary folder: {e}; set TMPDIR to a folder with room"),
-    })
 }
 
 #[async_trait]

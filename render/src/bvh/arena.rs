@@ -5,6 +5,8 @@ use std::ptr::NonNull;
 
 /// Size of a huge page on x86-64 and, most often, on aarch64.
 const HUGE: usize = 2 << 20;
+/// Arenas of so many bytes ask for huge pages; these round up what it takes by less than a quarter.
+const HUGE_FROM: usize = 8 << 20;
 
 /// Zeroed memory that is reserved at once and costs pages only where it was written.
 pub(super) struct Arena {
@@ -42,10 +44,13 @@ impl Arena {
         }
         let mapping = NonNull::new(address.cast::<u8>()).ok_or_else(std::io::Error::last_os_error)?;
         let skip = mapping.addr().get().next_multiple_of(HUGE) - mapping.addr().get();
+        // a small arena would take a huge page for each of its parts, and many of them are held at a time
         #[cfg(target_os = "linux")]
-        // SAFETY: the range is our own mapping. A system without huge pages refuses, and small ones serve, more slowly.
-        unsafe {
-            libc::madvise(address, mapped, libc::MADV_HUGEPAGE);
+        if len >= HUGE_FROM {
+            // SAFETY: the range is our own mapping. A system without huge pages refuses, and small ones serve, more slowly.
+            unsafe {
+                libc::madvise(address, mapped, libc::MADV_HUGEPAGE);
+            }
         }
         // SAFETY: skip < HUGE <= mapped - len.
         let base = unsafe { mapping.add(skip) };

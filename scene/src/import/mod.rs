@@ -87,6 +87,9 @@ pub fn import_surface(path: &Path, options: &ImportOptions) -> Result<Descriptio
 fn read(path: &Path, options: &ImportOptions) -> Result<(Description, Up, bool), ImportError> {
     let (kind, head) = kind(path)?;
     let bare = !matches!(kind, Kind::Mitsuba);
+    if bare && !options.defines.is_empty() {
+        return refuse(path, "a value of a name was given, but only an XML scene has names: leave -D out");
+    }
     let (mut out, up) = match kind {
         Kind::Mitsuba => {
             for (given, name) in [(options.iso.is_some(), "an iso value"), (options.albedo.is_some(), "an albedo")] {

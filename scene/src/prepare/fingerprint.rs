@@ -33,6 +33,14 @@ pub fn fingerprint(description: &Description) -> Result<ObjectHash, ImportError>
         path: PathBuf::new(),
         message: format!("the description cannot be written down: {e}"),
     })?);
+    for file in source_files(description) {
+        add(&mut hasher, file, true)?;
+    }
+    Ok(ObjectHash(*hasher.finalize().as_bytes()))
+}
+
+/// Files and folders that a description names: meshes, volumes, pictures.
+pub fn source_files(description: &Description) -> BTreeSet<&Path> {
     let shapes = description.shapes.iter().filter_map(|shape| match &shape.geometry {
         Geometry::MeshFile { path, .. } | Geometry::IsoSurface { path, .. } => Some(path.as_path()),
         Geometry::Inline { .. } | Geometry::Sphere { .. } => None,
@@ -45,10 +53,7 @@ pub fn fingerprint(description: &Description) -> Result<ObjectHash, ImportError>
         Some(Environment::Map { path, .. }) => Some(path.as_path()),
         _ => None,
     };
-    for file in shapes.chain(textures).chain(sky).collect::<BTreeSet<&Path>>() {
-        add(&mut hasher, file, true)?;
-    }
-    Ok(ObjectHash(*hasher.finalize().as_bytes()))
+    shapes.chain(textures).chain(sky).collect()
 }
 
 /// Adds a file, or the files of a folder.

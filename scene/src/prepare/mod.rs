@@ -56,7 +56,7 @@ use incidence::{CellBox, ChosenCells, Incidence, incidence};
 use ingest::Ingested;
 use spool::Spool;
 
-pub use fingerprint::fingerprint;
+pub use fingerprint::{fingerprint, source_files};
 pub use progress::{NoProgress, PrepareProgress, Stage};
 pub use report::{ByteKind, ByteOp, ByteRow, PrepareReport};
 pub use settings::{Cut, PrepareSettings, SpoolSettings};

@@ -2,8 +2,8 @@
 
 mod element;
 
-use std::collections::BTreeMap;
-use std::io::BufReader;
+use std::collections::{BTreeMap, BTreeSet};
+use std::io::{BufReader, Read};
 use std::path::{Path, PathBuf};
 
 use element::{DataSet, Failure, Tag};
@@ -160,14 +160,34 @@ fn scan(folder: &Path, bytes: &Bytes) -> Result<Scan, ImportError> {
     }
     names.sort();
     let mut images = Vec::new();
-    let mut others = 0;
+    let mut others = Vec::new();
     for path in names {
         match read(&path, bytes)? {
             Some(image) => images.push(image),
-            None => others += 1,
+            None => others.push(path),
         }
     }
-    Ok(Scan { images, others, folders })
+    // a slice at either end of a series leaves no gap when it is cut or lost: its name says that it should be there
+    let named: BTreeSet<String> = images.iter().map(|i: &Found| pattern(&i.path)).collect();
+    if let Some(path) = others.iter().find(|p| named.contains(&pattern(p)) && !begins_as_dicom(p, bytes)) {
+        let message = "this is no DICOM file, though it is named as the series' images are: get it again, or move it out of the folder";
+        return Err(malformed(path, 0, message));
+    }
+    Ok(Scan { images, others: others.len(), folders })
+}
+
+/// A file's name without its numbers.
+fn pattern(path: &Path) -> String {
+    let name = path.file_name().unwrap_or_default().to_string_lossy();
+    name.chars().filter(|c| !c.is_ascii_digit()).collect()
+}
+
+/// Whether a file is DICOM at all: a directory or a report holds no image, and is left out.
+fn begins_as_dicom(path: &Path, bytes: &Bytes) -> bool {
+    let mut first = [0; 132];
+    let file =
+        std::fs::metadata(path).ok().filter(std::fs::Metadata::is_file).and_then(|_| Counted::open(path, bytes).ok());
+    file.is_some_and(|mut file| file.read_exact(&mut first).is_ok()) && is_dicom(&first)
 }
 
 /// Reads one file's header; none if it is no DICOM file, or none of an image (a directory, a report).

@@ -263,6 +263,15 @@ fn errors() {
     ] {
         check(Image { syntax, ..next() }, name);
     }
+    // a slice at the end of a series that is empty, cut or something else leaves no gap, but its name tells
+    for bytes in [&b""[..], &good.bytes()[..100], &[7; 400]] {
+        let folder = Folder::new();
+        folder.write("slice1.dcm", &good.bytes());
+        folder.write("slice2.dcm", bytes);
+        folder.write("notes.txt", b"");
+        let message = error(folder.path());
+        assert!(message.contains("slice2.dcm") && message.contains("get it again"), "{message}");
+    }
     // no file that holds no image is in the way
     let folder = Folder::new();
     let whole = good.bytes();
