@@ -10,10 +10,15 @@ use crate::fault::Mistake;
 /// Most bytes of a job file: it holds settings, and thousands of cameras at most.
 const MOST_BYTES: u64 = 4 << 20;
 
+/// Reads a job file as it stands.
+pub fn parse_job(path: &Path) -> anyhow::Result<RenderJob> {
+    let text = bounded::read(path, MOST_BYTES, "this is no job file")?;
+    Ok(serde_yaml::from_slice(&text).map_err(|e| Mistake(format!("{}: {e}", path.display())))?)
+}
+
 /// Reads a job file. A relative source is relative to the file.
 pub fn read_job(path: &Path) -> anyhow::Result<RenderJob> {
-    let text = bounded::read(path, MOST_BYTES, "this is no job file")?;
-    let mut job: RenderJob = serde_yaml::from_slice(&text).map_err(|e| Mistake(format!("{}: {e}", path.display())))?;
+    let mut job = parse_job(path)?;
     let source = PathBuf::from(&job.spec.scene.source);
     if source.is_relative() && !job.spec.scene.source.is_empty() && !job.spec.scene.source.contains("://") {
         let beside = path.parent().unwrap_or(Path::new("")).join(source);

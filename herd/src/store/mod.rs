@@ -15,6 +15,7 @@ mod s3;
 #[cfg(any(test, feature = "testing"))]
 pub mod s3_server;
 mod spilling;
+mod watched;
 
 use async_trait::async_trait;
 use bytes::Bytes;
@@ -30,6 +31,7 @@ pub use replicated::{NodeView, Replicated, ReplicationCounts, Verify};
 pub use retrying::{RetryPolicy, Retrying};
 pub use s3::{S3Credentials, S3Settings, S3Store};
 pub use spilling::{Spilling, temporary_folder};
+pub use watched::{Patience, Pulse, TcpPulse, Watched};
 
 /// A flat space of named, immutable objects.
 ///
