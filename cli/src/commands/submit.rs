@@ -233,7 +233,7 @@ mod tests {
         assert_eq!(first.len(), 2, "{first:?}");
         assert_eq!(upload(&store, &scene.join("room.xml")).unwrap(), key);
         // cut off: the rest is sent
-        store.wait(store.blocks.delete(&[key.clone()])).unwrap();
+        store.wait(store.blocks.delete(std::slice::from_ref(&key))).unwrap();
         assert_eq!(upload(&store, &scene.join("room.xml")).unwrap(), key);
         assert_eq!(list(), first);
         fs::write(scene.join("textures/a.png"), "other").unwrap();
