@@ -102,6 +102,9 @@ pub struct RenderJobSpec {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[schemars(range(min = 0.01, max = 3600.0))]
     pub task_seconds: Option<f64>,
+    /// How much a cluster cares that workers run beside the data. The image is the same bytes for all of them.
+    #[serde(default)]
+    pub placement: Placement,
     /// Where a cluster keeps scenes, rays and pictures. A local run has no use for it.
     #[serde(default)]
     pub storage: StorageSpec,
@@ -129,6 +132,19 @@ pub struct StorageSpec {
     /// default.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub secret: Option<String>,
+}
+
+/// How much a cluster cares that workers run beside the data.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+pub enum Placement {
+    /// Workers are drawn to the nodes that hold most of the scene; where there is no room they run elsewhere.
+    #[default]
+    Preferred,
+    /// Workers run on nodes that hold some of the scene, and nowhere else: they wait until there is room.
+    Required,
+    /// Nobody looks where data lies: not for placing workers, not for dealing out work, not for choosing which copy to read. To
+    /// measure what the others gain.
+    None,
 }
 
 /// The scene and how it is imported.
@@ -263,6 +279,20 @@ pub struct WorkersSpec {
     /// default there is no limit.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub memory: Option<ByteSize>,
+    /// Seconds for which a cluster keeps a finished job's workers, so that the same job with more samples goes on at once; 0 by default.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schemars(range(min = 0, max = 86400))]
+    pub keep_warm_seconds: Option<i64>,
+    /// What a cluster's worker pods have beside what the operator gives them, as a PodTemplateSpec: labels, annotations, tolerations,
+    /// node selectors, priority classes, pull secrets, and of the container `worker` its resources and more.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schemars(schema_with = "any_object")]
+    pub template: Option<serde_json::Value>,
+}
+
+/// What another schema says, which is the API server's own.
+fn any_object(_: &mut schemars::SchemaGenerator) -> schemars::Schema {
+    schemars::json_schema!({"type": "object", "nullable": true, "x-kubernetes-preserve-unknown-fields": true})
 }
 
 impl RenderJob {

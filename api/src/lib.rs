@@ -15,8 +15,8 @@ pub mod validate;
 pub use byte_size::ByteSize;
 pub use image_size::ImageSize;
 pub use job::{
-    API_VERSION, CameraSpec, ImageSpec, KIND, LightSpec, Metadata, RenderJob, RenderJobSpec, SamplingSpec, SceneSpec,
-    StorageSpec, WorkersSpec,
+    API_VERSION, CameraSpec, ImageSpec, KIND, LightSpec, Metadata, Placement, RenderJob, RenderJobSpec, SamplingSpec,
+    SceneSpec, StorageSpec, WorkersSpec,
 };
 pub use strategy::Strategy;
 pub use validate::{Problem, validate};

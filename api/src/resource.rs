@@ -17,7 +17,7 @@ pub struct RenderJobStatus {
     /// The generation of the spec that this status is of.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub observed_generation: Option<i64>,
-    /// `Accepted`, `Prepared`, `Running`, `Suspended`, `Complete`, `Failed`.
+    /// `Accepted`, `Prepared`, `Running`, `Degraded`, `Suspended`, `Complete`, `Failed`.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     #[schemars(extend("x-kubernetes-list-type" = "map", "x-kubernetes-list-map-keys" = ["type"]))]
     pub conditions: Vec<Condition>,
@@ -48,12 +48,18 @@ pub struct RenderJobStatus {
     /// The prepared scene, by the hash of its manifest.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub scene: Option<String>,
+    /// Names the settings that it was prepared with.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub scene_settings: Option<String>,
     /// `per node` where each store is on a node of the cluster, else `none`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub locality: Option<String>,
     /// Of each frame that was begun, the newest round record that counts.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub ledger: Vec<LedgerPointer>,
+    /// Committed tasks of the frames that are done that were done again, because all copies of what they made were lost.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub tasks_redone: Option<i64>,
     /// The finished pictures.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub pictures: Vec<String>,

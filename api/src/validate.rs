@@ -145,6 +145,10 @@ fn check_workers(c: &mut Checks, job: &RenderJob) {
     c.check("spec.workers.memory", workers.memory.is_none_or(|m| m.bytes() > 0), || {
         "is 0: give the memory of one node, such as 4Gi".into()
     });
+    c.range("spec.workers.keepWarmSeconds", workers.keep_warm_seconds.map(|s| s as f64), 0.0, 86400.0);
+    c.check("spec.workers.template", workers.template.as_ref().is_none_or(serde_json::Value::is_object), || {
+        "is no object: give a PodTemplateSpec, with metadata and spec".into()
+    });
     c.range("spec.replicas", job.spec.replicas.map(f64::from), 1.0, 16.0);
     let known_nodes = workers.nodes.map_or(workers.slots.len().max(1), |n| n.max(1) as usize);
     if let Some(replicas) = job.spec.replicas {

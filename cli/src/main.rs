@@ -1,6 +1,7 @@
 //! `rayherd`: renders, prepares, compares, replays.
 
 mod bounded;
+mod cluster;
 mod commands;
 mod fault;
 mod frames;

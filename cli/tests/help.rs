@@ -4,7 +4,8 @@ mod common;
 
 use common::rayherd;
 
-const COMMANDS: [&str; 8] = ["render", "check", "prepare", "inspect", "compare", "replay", "gc", "scene"];
+const COMMANDS: [&str; 11] =
+    ["render", "check", "prepare", "inspect", "compare", "replay", "gc", "scene", "submit", "jobs", "logs"];
 
 #[test]
 fn every_command_has_help_with_an_example() {

@@ -201,7 +201,7 @@ pub struct Report {
     pub spilled_bytes: u64,
     /// Contributions that were not finite or too large.
     pub non_finite: u64,
-    /// The samples of the first of them, by pixel: as many as a film keeps. Empty on a cluster, whose operator reads no film.
+    /// The samples of the first of them, by pixel: as many as a film keeps.
     pub non_finite_at: Vec<SampleKey>,
     /// Estimated error of the image, from its halves; none with one sample per pixel.
     pub rel_mse: Option<f64>,
@@ -216,6 +216,15 @@ pub struct Report {
 }
 
 impl Report {
+    /// Notes contributions that were not finite, by pixel number (of a picture of this width) and sample, and tells of them.
+    pub fn note_non_finite<'k>(&mut self, width: u32, keys: impl IntoIterator<Item = &'k (u32, u32)>) {
+        for &(pixel, sample) in keys {
+            let [x, y] = [pixel % width, pixel / width];
+            tracing::warn!("pixel {x},{y} sample {sample}: a contribution is not finite or too large");
+            self.non_finite_at.push(SampleKey { pixel: [x, y], sample });
+        }
+    }
+
     /// Adds what preparing moved before; it belongs to no node, so nothing else follows from it.
     pub fn add_prepare_bytes(&mut self, rows: impl IntoIterator<Item = (Op, Kind, u64)>) {
         let mut all = Bytes::default();

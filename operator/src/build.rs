@@ -1,10 +1,11 @@
 //! The pods of a job. Pure: a function of the job, its storage and what lies where.
 
 use std::collections::BTreeMap;
+use std::time::Duration;
 
 use k8s_openapi::api::core::v1::Pod;
-use rayherd_api::ByteSize;
 use rayherd_api::resource::RenderJobObject;
+use rayherd_api::{ByteSize, Placement, RenderJobSpec};
 use rayherd_herd::remote::Storage;
 use serde_json::{Value, json};
 
@@ -35,10 +36,27 @@ pub fn memory(job: &RenderJobObject) -> u64 {
     job.spec.workers.memory.map_or(DEFAULT_MEMORY, ByteSize::bytes)
 }
 
-/// The pod of a worker. `held` are the scene's bytes by node, `trusted` the certificates that the operator is known by.
+/// How long the workers of a job that came to its end are kept, if at all.
+pub fn keep_warm(job: &RenderJobObject) -> Option<Duration> {
+    let seconds = job.spec.workers.keep_warm_seconds.and_then(|s| u64::try_from(s).ok())?;
+    (seconds > 0).then(|| Duration::from_secs(seconds))
+}
+
+/// Whether the workers of one spec can go on with another: pods of the same numbers would be made alike.
+pub fn same_workers(old: &RenderJobSpec, new: &RenderJobSpec) -> bool {
+    let slots = |s: &RenderJobSpec| s.workers.slots_per_node(1).unwrap_or_else(|| vec![1]);
+    let (a, b) = (&old.workers, &new.workers);
+    slots(old).iter().zip(slots(new)).all(|(x, y)| *x == y)
+        && (a.memory, &a.template, &old.storage, old.placement) == (b.memory, &b.template, &new.storage, new.placement)
+}
+
+/// The pod of a worker, as JSON. `held` are the scene's bytes by node, `trusted` the certificates that the operator is known by.
+///
+/// What the job's template says comes on top of ours, but for what makes the pod a worker: its name, its owner, its labels, its token
+/// and its settings.
 ///
 /// # Errors
-/// When the job has no name or uid, which the API server excludes, or the pod cannot be written down.
+/// When the pod cannot be written down.
 pub fn pod(
     job: &RenderJobObject,
     config: &Config,
@@ -47,7 +65,7 @@ pub fn pod(
     trusted: &str,
     number: u32,
     name: &str,
-) -> Result<Pod, serde_json::Error> {
+) -> Result<Value, serde_json::Error> {
     let slots = slots(job).get(number as usize).copied().unwrap_or(1);
     let memory = memory(job) + PROCESS_BYTES + u64::from(slots) * SLOT_BYTES;
     let resources = json!({"cpu": slots.to_string(), "memory": memory.to_string()});
@@ -67,7 +85,39 @@ pub fn pod(
         field("RAYHERD_POD", "metadata.name"),
         field("RAYHERD_NODE", "spec.nodeName"),
     ];
-    serde_json::from_value(json!({
+    let mut pod = json!({
+        "spec": {
+            "enableServiceLinks": false,
+            "terminationGracePeriodSeconds": GRACE_SECONDS,
+            "affinity": affinity(&uid, held, job.spec.placement),
+            "securityContext": {
+                "runAsNonRoot": true,
+                "runAsUser": 65532,
+                "runAsGroup": 65532,
+                "fsGroup": 65532,
+                "seccompProfile": {"type": "RuntimeDefault"},
+            },
+            "containers": [{
+                "name": "worker",
+                "image": config.image,
+                "resources": {"requests": resources, "limits": resources},
+                "securityContext": {
+                    "allowPrivilegeEscalation": false,
+                    "readOnlyRootFilesystem": true,
+                    "capabilities": {"drop": ["ALL"]},
+                },
+                "volumeMounts": [{"name": "scratch", "mountPath": "/scratch"}],
+            }],
+            "volumes": [{"name": "scratch", "emptyDir": {}}],
+        },
+    });
+    // of a template metadata and spec count; kind and version may be written
+    for part in ["metadata", "spec"] {
+        if let Some(wanted) = job.spec.workers.template.as_ref().and_then(|t| t.get(part)) {
+            merge(&mut pod[part], wanted);
+        }
+    }
+    let ours = json!({
         "apiVersion": "v1",
         "kind": "Pod",
         "metadata": {
@@ -79,56 +129,63 @@ pub fn pod(
                 "app.kubernetes.io/name": "rayherd-worker",
                 "app.kubernetes.io/managed-by": "rayherd-operator",
             },
-            "ownerReferences": [{
-                "apiVersion": rayherd_api::API_VERSION,
-                "kind": rayherd_api::KIND,
-                "name": job.metadata.name,
-                "uid": uid,
-                "controller": true,
-                "blockOwnerDeletion": true,
-            }],
         },
         "spec": {
             "automountServiceAccountToken": false,
-            "enableServiceLinks": false,
             "restartPolicy": "OnFailure",
-            "terminationGracePeriodSeconds": GRACE_SECONDS,
-            "affinity": affinity(&uid, held),
-            "securityContext": {
-                "runAsNonRoot": true,
-                "runAsUser": 65532,
-                "runAsGroup": 65532,
-                "fsGroup": 65532,
-                "seccompProfile": {"type": "RuntimeDefault"},
-            },
             "containers": [{
                 "name": "worker",
-                "image": config.image,
                 "env": env,
                 "envFrom": [{"secretRef": {"name": secret_name(&job.spec.storage)}}],
-                "resources": {"requests": resources, "limits": resources},
-                "securityContext": {
-                    "allowPrivilegeEscalation": false,
-                    "readOnlyRootFilesystem": true,
-                    "capabilities": {"drop": ["ALL"]},
-                },
-                "volumeMounts": [
-                    {"name": "scratch", "mountPath": "/scratch"},
-                    {"name": "token", "mountPath": "/var/run/secrets/rayherd", "readOnly": true},
-                ],
+                "volumeMounts": [{"name": "token", "mountPath": "/var/run/secrets/rayherd", "readOnly": true}],
             }],
-            "volumes": [
-                {"name": "scratch", "emptyDir": {}},
-                {"name": "token", "projected": {"sources": [
-                    {"serviceAccountToken": {"audience": AUDIENCE, "expirationSeconds": 3600, "path": "token"}},
-                ]}},
-            ],
+            "volumes": [{"name": "token", "projected": {"sources": [
+                {"serviceAccountToken": {"audience": AUDIENCE, "expirationSeconds": 3600, "path": "token"}},
+            ]}}],
         },
-    }))
+    });
+    merge(&mut pod, &ours);
+    pod["metadata"]["ownerReferences"] = json!([{
+        "apiVersion": rayherd_api::API_VERSION,
+        "kind": rayherd_api::KIND,
+        "name": job.metadata.name,
+        "uid": uid,
+        "controller": true,
+        "blockOwnerDeletion": true,
+    }]);
+    Ok(pod)
+}
+
+/// Puts one object on top of another. Lists are joined: an item of a name (or mount path) that is there is merged into that one, others
+/// are added. Lists of plain values (a command) are replaced.
+fn merge(base: &mut Value, top: &Value) {
+    match (base, top) {
+        (Value::Object(base), Value::Object(top)) => {
+            for (name, value) in top {
+                match base.get_mut(name) {
+                    Some(known) => merge(known, value),
+                    None => drop(base.insert(name.clone(), value.clone())),
+                }
+            }
+        }
+        (Value::Array(base), Value::Array(top)) if top.iter().all(Value::is_object) => {
+            // mounts of one volume differ in their paths
+            let key =
+                |v: &Value| ["mountPath", "name"].iter().find_map(|k| v.get(k)?.as_str().map(|s| (*k, s.to_owned())));
+            for item in top {
+                let known = base.iter_mut().find(|b| key(item).is_some() && key(b) == key(item));
+                match known {
+                    Some(known) => merge(known, item),
+                    None => base.push(item.clone()),
+                }
+            }
+        }
+        (base, top) => *base = top.clone(),
+    }
 }
 
 /// Nodes are preferred by the bytes that they hold, and one worker to a node before two.
-fn affinity(uid: &str, held: &BTreeMap<String, u64>) -> Value {
+fn affinity(uid: &str, held: &BTreeMap<String, u64>, placement: Placement) -> Value {
     let most = held.values().copied().max().unwrap_or(0);
     let weight = |bytes: u64| (u128::from(bytes) * 100).div_ceil(u128::from(most.max(1))).clamp(1, 100) as u64;
     let terms: Vec<Value> = held
@@ -146,8 +203,15 @@ fn affinity(uid: &str, held: &BTreeMap<String, u64>) -> Value {
             "labelSelector": {"matchLabels": {LABEL: uid}},
         },
     }]}});
-    if !terms.is_empty() {
-        affinity["nodeAffinity"] = json!({"preferredDuringSchedulingIgnoredDuringExecution": terms});
+    if placement == Placement::None || terms.is_empty() {
+        return affinity;
+    }
+    affinity["nodeAffinity"] = json!({"preferredDuringSchedulingIgnoredDuringExecution": terms});
+    if placement == Placement::Required {
+        let nodes: Vec<&String> = held.iter().filter(|(_, bytes)| **bytes > 0).map(|(node, _)| node).collect();
+        let expression = json!({"key": "kubernetes.io/hostname", "operator": "In", "values": nodes});
+        affinity["nodeAffinity"]["requiredDuringSchedulingIgnoredDuringExecution"] =
+            json!({"nodeSelectorTerms": [{"matchExpressions": [expression]}]});
     }
     affinity
 }
@@ -234,7 +298,8 @@ mod tests {
             endpoints: vec![Endpoint { url: "http://m".into(), node: Some("node1".into()) }],
         };
         let held = BTreeMap::from([("node1".to_owned(), 1000), ("node2".to_owned(), 1), ("node3".to_owned(), 0)]);
-        let pod = pod(&job(), &config(), &storage, &held, "PEM", 1, "box-w1").unwrap();
+        let pod: Pod =
+            serde_json::from_value(pod(&job(), &config(), &storage, &held, "PEM", 1, "box-w1").unwrap()).unwrap();
         let spec = pod.spec.unwrap();
         assert_eq!(spec.automount_service_account_token, Some(false));
         let container = &spec.containers[0];
@@ -251,6 +316,85 @@ mod tests {
         assert_eq!(terms.iter().map(|t| t.weight).collect::<Vec<_>>(), [100, 1]);
         let owner = &pod.metadata.owner_references.unwrap()[0];
         assert_eq!((owner.uid.as_str(), owner.controller), ("u-1", Some(true)));
+    }
+
+    #[test]
+    fn a_template_comes_on_top_but_a_worker_stays_one() {
+        let storage = Storage { bucket: "b".into(), prefix: String::new(), region: "r".into(), endpoints: vec![] };
+        let held = BTreeMap::from([("node1".to_owned(), 1000)]);
+        let made = |job: &RenderJobObject| pod(job, &config(), &storage, &held, "PEM", 1, "box-w1").unwrap();
+        let mut with = job();
+        with.spec.workers.template = Some(json!({
+            "metadata": {"name": "mine", "labels": {"team": "a", LABEL: "other"}, "ownerReferences": [{"name": "x"}]},
+            "spec": {
+                "restartPolicy": "Never",
+                "automountServiceAccountToken": true,
+                "priorityClassName": "night",
+                "tolerations": [{"key": "spot", "operator": "Exists"}],
+                "volumes": [{"name": "fast", "emptyDir": {"medium": "Memory"}}],
+                "affinity": {"nodeAffinity": {"preferredDuringSchedulingIgnoredDuringExecution": [
+                    {"weight": 5, "preference": {"matchExpressions": [{"key": "disk", "operator": "Exists"}]}},
+                ]}},
+                "containers": [
+                    {
+                        "name": "worker",
+                        "resources": {"limits": {"memory": "8Gi"}},
+                        "env": [{"name": "RUST_LOG", "value": "debug"}, {"name": "RAYHERD_JOB", "value": "other"}],
+                        "volumeMounts": [{"name": "fast", "mountPath": "/fast"}, {"name": "fast", "mountPath": "/scratch"}],
+                    },
+                    {"name": "beside", "image": "b:1"},
+                ],
+            },
+        }));
+        let both = made(&with);
+        let at = |path: &str| both.pointer(path).cloned().unwrap_or_default();
+        assert_eq!((at("/metadata/name"), at("/metadata/labels/team")), (json!("box-w1"), json!("a")));
+        assert_eq!(both["metadata"]["labels"][LABEL], json!("u-1"));
+        assert_eq!(at("/metadata/ownerReferences").as_array().map(Vec::len), Some(1));
+        assert_eq!(at("/metadata/ownerReferences/0/uid"), json!("u-1"));
+        assert_eq!(
+            (at("/spec/restartPolicy"), at("/spec/automountServiceAccountToken")),
+            (json!("OnFailure"), json!(false))
+        );
+        assert_eq!(at("/spec/priorityClassName"), json!("night"));
+        let terms = at("/spec/affinity/nodeAffinity/preferredDuringSchedulingIgnoredDuringExecution");
+        assert_eq!(terms.as_array().map(Vec::len), Some(2), "ours and theirs");
+        let worker = at("/spec/containers/0");
+        assert_eq!(at("/spec/containers/1/name"), json!("beside"));
+        assert_eq!(worker["resources"]["limits"]["memory"], json!("8Gi"));
+        let env = |name: &str| {
+            let all = worker["env"].as_array().unwrap().iter().filter(|e| e["name"] == name);
+            all.map(|e| e["value"].clone()).collect::<Vec<_>>()
+        };
+        assert_eq!((env("RUST_LOG"), env("RAYHERD_JOB")), (vec![json!("debug")], vec![json!("u-1")]));
+        let mounts: Vec<(String, String)> = (worker["volumeMounts"].as_array().unwrap().iter())
+            .map(|m| (m["mountPath"].as_str().unwrap().into(), m["name"].as_str().unwrap().into()))
+            .collect();
+        let of = |path: &str| mounts.iter().filter(|m| m.0 == path).map(|m| m.1.as_str()).collect::<Vec<_>>();
+        assert_eq!((of("/scratch"), of("/fast")), (vec!["fast"], vec!["fast"]));
+        assert_eq!(of("/var/run/secrets/rayherd"), ["token"]);
+        serde_json::from_value::<Pod>(both).unwrap();
+        // where it may run
+        with.spec.placement = Placement::Required;
+        let path = "/spec/affinity/nodeAffinity/requiredDuringSchedulingIgnoredDuringExecution/nodeSelectorTerms/0/matchExpressions/0/values";
+        assert_eq!(made(&with).pointer(path), Some(&json!(["node1"])));
+        let mut without = job();
+        without.spec.placement = Placement::None;
+        assert_eq!(made(&without).pointer("/spec/affinity/nodeAffinity"), None);
+    }
+
+    #[test]
+    fn workers_stay_when_what_they_are_made_of_does() {
+        let old = job().spec;
+        let mut new = old.clone();
+        new.sampling.spp = Some(64);
+        new.workers.nodes = Some(5);
+        assert!(same_workers(&old, &new));
+        new.workers.template = Some(json!({}));
+        assert!(!same_workers(&old, &new));
+        let mut new = old.clone();
+        new.workers.slots = vec![3];
+        assert!(!same_workers(&old, &new));
     }
 
     #[test]

@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use k8s_openapi::jiff::Timestamp;
+use rayherd_api::RenderJobSpec;
 use rayherd_herd::job::Status;
 use rayherd_herd::remote::{Fleet, Storage};
 use rayherd_herd::report::Report;
@@ -12,6 +13,8 @@ use rayherd_herd::report::Report;
 pub struct Running {
     /// The generation of the spec that it runs.
     pub generation: i64,
+    /// That spec.
+    pub spec: RenderJobSpec,
     /// Its workers.
     pub fleet: Fleet,
     /// Its storage, as it was when the job began.
@@ -31,6 +34,10 @@ pub struct State {
     pub scene: Option<String>,
     /// It was prepared before.
     pub reused: bool,
+    /// Its manifest was known from the job's status: workers of an earlier run may be there.
+    pub known: bool,
+    /// Of what there are too few copies.
+    pub below: Option<String>,
     /// The scene's bytes by node.
     pub held: BTreeMap<String, u64>,
     /// Of the current frame.
@@ -85,6 +92,12 @@ impl Jobs {
     pub fn remove(&self, uid: &str) {
         if let Some(running) = self.lock().remove(uid) {
             running.fleet.end();
+        }
+    }
+    /// Forgets a job whose workers wait for whoever goes on with it.
+    pub fn hand_over(&self, uid: &str) {
+        if let Some(running) = self.lock().remove(uid) {
+            running.fleet.retire();
         }
     }
     /// All of them.

@@ -5,7 +5,9 @@ use std::sync::Arc;
 use axum::Router;
 use axum::extract::State;
 use axum::routing::get;
-use prometheus::{Encoder, GaugeVec, Histogram, HistogramOpts, IntCounter, IntCounterVec, Opts, Registry, TextEncoder};
+use prometheus::{
+    Encoder, GaugeVec, Histogram, HistogramOpts, IntCounter, IntCounterVec, IntGauge, Opts, Registry, TextEncoder,
+};
 use rayherd_herd::report::{Kind, Op, Place};
 
 use crate::jobs::Running;
@@ -21,6 +23,8 @@ pub struct Metrics {
     /// Reports that nobody waits for (any more).
     pub ignored: IntCounter,
     refused: IntCounterVec,
+    /// 1 for the operator that leads.
+    pub leader: IntGauge,
     /// How long steps take.
     pub reconcile_seconds: Histogram,
     cpu: GaugeVec,
@@ -30,6 +34,10 @@ pub struct Metrics {
     tasks: GaugeVec,
     waiting: GaugeVec,
     workers: GaugeVec,
+    wanted: GaugeVec,
+    slots: GaugeVec,
+    progress: GaugeVec,
+    degraded: GaugeVec,
     error: GaugeVec,
 }
 
@@ -83,6 +91,8 @@ impl Metrics {
         let refused =
             IntCounterVec::new(Opts::new(name, "requests to the task server that were refused"), &["reason"])?;
         registry.register(Box::new(refused.clone()))?;
+        let leader = IntGauge::new("rayherd_leader", "1 for the operator that leads, 0 for one that waits")?;
+        registry.register(Box::new(leader.clone()))?;
         for reason in Refused::ALL {
             refused.with_label_values(&[reason.name()]);
         }
@@ -91,6 +101,7 @@ impl Metrics {
             started: counter("rayherd_jobs_started_total", "jobs that were begun or gone on with")?,
             ignored: counter("rayherd_worker_reports_ignored_total", "reports of work that nobody waits for")?,
             refused,
+            leader,
             cpu: gauge("rayherd_job_cpu_seconds", "CPU-seconds of the workers' tasks", &JOB)?,
             remote: gauge("rayherd_job_remote_read_ratio", "scene bytes read from other nodes, of all read", &JOB)?,
             bytes: gauge("rayherd_job_bytes", "bytes moved", &["namespace", "job", "stage", "op", "kind", "place"])?,
@@ -98,6 +109,10 @@ impl Metrics {
             tasks: gauge("rayherd_job_tasks", "tasks committed for the frames that are done", &JOB)?,
             waiting: gauge("rayherd_job_rays_waiting", "rays that wait in groups", &JOB)?,
             workers: gauge("rayherd_job_workers_ready", "workers that ask for work", &JOB)?,
+            wanted: gauge("rayherd_job_workers_wanted", "workers that the job asks for", &JOB)?,
+            slots: gauge("rayherd_job_slots", "tasks that all its workers do at a time", &JOB)?,
+            progress: gauge("rayherd_job_progress_ratio", "camera samples made of those asked for", &JOB)?,
+            degraded: gauge("rayherd_job_degraded", "1 while there are fewer copies than asked for", &JOB)?,
             error: gauge("rayherd_job_relmse", "estimated relMSE of the last frame that is done", &JOB)?,
             reconcile_seconds,
             registry,
@@ -135,6 +150,12 @@ impl Metrics {
         self.tasks.with_label_values(&labels).set(state.reports.iter().map(|r| r.tasks).sum::<u64>() as f64);
         self.waiting.with_label_values(&labels).set(state.status.waiting as f64);
         self.workers.with_label_values(&labels).set(f64::from(tally.ready));
+        let slots = running.spec.workers.slots_per_node(1).unwrap_or_default();
+        self.wanted.with_label_values(&labels).set(slots.len() as f64);
+        self.slots.with_label_values(&labels).set(slots.iter().map(|&s| f64::from(s)).sum());
+        let (made, of) = (state.status.samples, state.status.samples_total.max(1));
+        self.progress.with_label_values(&labels).set((made as f64 / of as f64).min(1.0));
+        self.degraded.with_label_values(&labels).set(f64::from(u8::from(state.below.is_some())));
         if let Some(error) = state.reports.last().and_then(|r| r.rel_mse) {
             self.error.with_label_values(&labels).set(error);
         }
@@ -142,7 +163,19 @@ impl Metrics {
 
     /// A job has ended: its labels go.
     pub fn forget(&self, namespace: &str, job: &str) {
-        let gauges = [&self.cpu, &self.remote, &self.rounds, &self.tasks, &self.waiting, &self.workers, &self.error];
+        let gauges = [
+            &self.cpu,
+            &self.remote,
+            &self.rounds,
+            &self.tasks,
+            &self.waiting,
+            &self.workers,
+            &self.wanted,
+            &self.slots,
+            &self.progress,
+            &self.degraded,
+            &self.error,
+        ];
         for gauge in gauges {
             // one that was never set has nothing to remove
             let _ = gauge.remove_label_values(&[namespace, job]);
@@ -188,6 +221,50 @@ pub async fn serve(context: Arc<Context>) -> anyhow::Result<()> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    /// Words of a text that look like a metric's name, without the ends that a histogram adds.
+    fn named(text: &str) -> Vec<String> {
+        let words = text.split(|c: char| !(c.is_ascii_alphanumeric() || c == '_'));
+        let ours = words.filter(|w| w.starts_with("rayherd_")).map(|w| w.trim_end_matches("_bucket").to_owned());
+        ours.collect()
+    }
+
+    #[test]
+    fn alerts_and_dashboard_name_metrics_that_exist() {
+        let metrics = Metrics::new().unwrap();
+        // a family without a value is not shown
+        for gauge in
+            [&metrics.cpu, &metrics.remote, &metrics.rounds, &metrics.tasks, &metrics.waiting, &metrics.workers]
+        {
+            gauge.with_label_values(&["n", "j"]).set(1.0);
+        }
+        for gauge in [&metrics.wanted, &metrics.slots, &metrics.progress, &metrics.degraded, &metrics.error] {
+            gauge.with_label_values(&["n", "j"]).set(1.0);
+        }
+        metrics.bytes.with_label_values(&["n", "j", "trace", "read", "geometry", "local"]).set(1.0);
+        let shown = metrics.text().unwrap();
+        let exist: Vec<&str> = shown.lines().filter_map(|l| l.strip_prefix("# TYPE ")?.split(' ').next()).collect();
+        let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/../charts/rayherd/monitoring");
+        let rules = std::fs::read_to_string(format!("{folder}/rules.yaml")).unwrap();
+        let dashboard = std::fs::read_to_string(format!("{folder}/dashboard.json")).unwrap();
+        let rules: serde_json::Value = serde_yaml::from_str(&rules).unwrap();
+        let dashboard: serde_json::Value = serde_json::from_str(&dashboard).unwrap();
+        let alerts = rules["groups"][0]["rules"].as_array().unwrap();
+        let panels = dashboard["panels"].as_array().unwrap();
+        assert!((6..=10).contains(&alerts.len()) && panels.len() > 8);
+        let alerts = alerts.iter().map(|a| {
+            assert!(a["annotations"]["action"].is_string(), "{} does not say what to do", a["alert"]);
+            a["expr"].as_str().unwrap()
+        });
+        let mut count = 0;
+        for expression in alerts.chain(panels.iter().map(|p| p["targets"][0]["expr"].as_str().unwrap())) {
+            for name in named(expression) {
+                assert!(exist.contains(&name.as_str()), "{expression}: there is no metric {name}");
+                count += 1;
+            }
+        }
+        assert!(count > 18, "{count}");
+    }
 
     #[test]
     fn names_are_unique_and_ended_jobs_leave_no_labels() {

@@ -1,13 +1,16 @@
 //! One step towards what a RenderJob asks for: look, decide, apply, tell.
 
+use std::collections::BTreeMap;
 use std::sync::{Arc, PoisonError, RwLock};
 use std::time::{Duration, Instant};
 
 use k8s_openapi::NamespaceResourceScope;
 use k8s_openapi::api::core::v1::Pod;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
-use k8s_openapi::jiff::Timestamp;
-use kube::api::{ApiResource, DeleteParams, DynamicObject, ListParams, Patch, PatchParams, Preconditions};
+use k8s_openapi::jiff::{SignedDuration, Timestamp};
+use kube::api::{
+    ApiResource, DeleteParams, DynamicObject, ListParams, Patch, PatchParams, Preconditions, ValidationDirective,
+};
 use kube::core::DeserializeGuard;
 use kube::core::error_boundary::InvalidObject;
 use kube::runtime::controller::Action;
@@ -36,6 +39,8 @@ pub const FINALIZER: &str = "rayherd.io/storage";
 const LOOK: Duration = Duration::from_secs(1);
 /// Before it is looked again whether a job that was stopped has stopped.
 const SOON: Duration = Duration::from_millis(200);
+/// A known scene is found within this time, or prepared again.
+const LOOK_UP: SignedDuration = SignedDuration::from_secs(5);
 /// Before a job whose surroundings are not there (yet) is looked at again.
 const AGAIN: Duration = Duration::from_secs(10);
 
@@ -98,6 +103,9 @@ pub enum Error {
     /// The storage cannot be found out.
     #[error(transparent)]
     Storage(#[from] StorageError),
+    /// The API server does not take the workers' pods as the job wants them.
+    #[error("{0}")]
+    Template(String),
     /// The storage does not do it.
     #[error("cannot clean the storage: {0}")]
     Clean(String),
@@ -140,6 +148,12 @@ async fn step(job: &Arc<RenderJobObject>, context: &Arc<Context>) -> Result<Acti
         return delete(job, context, &jobs, &uid).await;
     }
     if status::is_finished(job) {
+        // its workers wait for more samples, if this operator has them
+        if let Some(left) = status::warm(job, Timestamp::now())
+            && context.jobs.get(&uid).is_some()
+        {
+            return Ok(Action::requeue(left));
+        }
         context.jobs.remove(&uid);
         remove_pods(job, context, &namespace, &uid).await?;
         return expire(job, &jobs).await;
@@ -175,22 +189,27 @@ async fn step(job: &Arc<RenderJobObject>, context: &Arc<Context>) -> Result<Acti
             if !old.is_over() {
                 return Ok(Action::requeue(SOON));
             }
-            old.fleet.end();
-            start(job, context, &namespace, &uid).await?
-        }
-        None => match start(job, context, &namespace, &uid).await {
-            Err(Error::Storage(e @ StorageError::Missing(_))) => {
-                let refused = status::refused(job, "StorageMissing", &e.to_string(), false, Timestamp::now());
-                tell(job, context, &jobs, refused).await?;
-                return Ok(Action::requeue(AGAIN));
+            let keeps = build::same_workers(&old.spec, &job.spec);
+            if !keeps {
+                old.fleet.end();
             }
-            other => other?,
+            match begin(job, context, &jobs, (&namespace, &uid), Some(old.as_ref()).filter(|_| keeps)).await? {
+                Ok(running) => {
+                    old.fleet.retire();
+                    running
+                }
+                Err(later) => return Ok(later),
+            }
+        }
+        None => match begin(job, context, &jobs, (&namespace, &uid), None).await? {
+            Ok(running) => running,
+            Err(later) => return Ok(later),
         },
     };
     let stopped = matches!(&running.lock().end, Some((_, Err(p))) if p.stopped);
     if stopped {
-        // somebody else moved the ledger, or the API server was away too long: begin anew from what it says
-        context.jobs.remove(&uid);
+        // somebody else moved the ledger, or the API server or the stores were away too long: begin anew from what it says
+        context.jobs.hand_over(&uid);
         return Ok(Action::requeue(AGAIN));
     }
     // asked before its end is told: one that comes in between is told next time
@@ -201,11 +220,41 @@ async fn step(job: &Arc<RenderJobObject>, context: &Arc<Context>) -> Result<Acti
     tell(job, context, &jobs, status::running(job, &running, Timestamp::now())).await?;
     context.metrics.observe(&namespace, &job.name_any(), &running);
     if over {
+        if let Some(warm) = build::keep_warm(job)
+            && matches!(&running.lock().end, Some((_, Ok(()))))
+        {
+            return Ok(Action::requeue(warm));
+        }
         context.jobs.remove(&uid);
         remove_pods(job, context, &namespace, &uid).await?;
         return Ok(Action::await_change());
     }
     Ok(Action::requeue(LOOK))
+}
+
+/// Begins to run a job; else when to look at it again, of which it was told why it does not run.
+async fn begin(
+    job: &Arc<RenderJobObject>,
+    context: &Arc<Context>,
+    jobs: &Api<Seen>,
+    (namespace, uid): (&str, &str),
+    before: Option<&Running>,
+) -> Result<Result<Arc<Running>, Action>, Error> {
+    match start(job, context, namespace, uid, before).await {
+        Err(Error::Storage(e @ StorageError::Missing(_))) => {
+            let refused = status::refused(job, "StorageMissing", &e.to_string(), false, Timestamp::now());
+            tell(job, context, jobs, refused).await?;
+            Ok(Err(Action::requeue(AGAIN)))
+        }
+        Err(Error::Template(message)) => {
+            // what is left of an earlier spec goes with it
+            context.jobs.remove(uid);
+            remove_pods(job, context, namespace, uid).await?;
+            tell(job, context, jobs, status::refused(job, "BadTemplate", &message, true, Timestamp::now())).await?;
+            Ok(Err(Action::await_change()))
+        }
+        other => other.map(Ok),
+    }
 }
 
 /// Stops a job, if it runs here; whether it has stopped. What was committed stays.
@@ -269,9 +318,13 @@ async fn start(
     context: &Arc<Context>,
     namespace: &str,
     uid: &str,
+    before: Option<&Running>,
 ) -> Result<Arc<Running>, Error> {
     let jobs: Api<RenderJobObject> = Api::namespaced(context.client.clone(), namespace);
     let (storage, depot) = depot(context, job, namespace).await?;
+    if job.spec.workers.template.is_some() {
+        try_pod(job, context, namespace, &storage).await?;
+    }
     let finalizers = job.metadata.finalizers.clone().unwrap_or_default();
     let job = if !finalizers.iter().any(|f| f == FINALIZER) {
         let all: Vec<String> = finalizers.into_iter().chain([FINALIZER.to_owned()]).collect();
@@ -284,7 +337,7 @@ async fn start(
         jobs.get(&job.name_any()).await.map_err(api("read the job"))?
     };
     let job = Arc::new(job);
-    let running = run::start(context.client.clone(), job, storage, depot, context.turns.clone());
+    let running = run::start(context.client.clone(), job, storage, depot, context.turns.clone(), before);
     context.jobs.insert(uid, running.clone());
     context.metrics.started.inc();
     Ok(running)
@@ -312,13 +365,15 @@ async fn keep_pods(
 ) -> Result<(), Error> {
     let pods: Api<Pod> = Api::namespaced(context.client.clone(), namespace);
     let found = list_pods(&pods, uid).await?;
-    let (held, prepared) = {
+    let (held, prepared, waits) = {
         let state = running.lock();
-        (state.held.clone(), state.scene.is_some())
+        // a known scene is looked up at once: workers of an earlier run must not go for that moment
+        let fresh = state.started.is_some_and(|t| Timestamp::now().duration_since(t) < LOOK_UP);
+        (state.held.clone(), state.scene.is_some(), state.known && fresh)
     };
     // until it is known where the scene's blocks are, one worker prepares it
     let wanted = if prepared { build::slots(job).len() as u32 } else { 1 };
-    let plan = build::plan(&job.name_any(), &found, wanted);
+    let plan = if waits && !prepared { build::Plan::default() } else { build::plan(&job.name_any(), &found, wanted) };
     {
         let living = found.iter().filter(|p| p.metadata.deletion_timestamp.is_none());
         let by_uid = living.filter_map(|p| Some((p.metadata.uid.clone()?, build::number(p)?)));
@@ -328,16 +383,42 @@ async fn keep_pods(
         delete_pod(&pods, name).await?;
     }
     let trusted = context.trusted.read().unwrap_or_else(PoisonError::into_inner).clone();
+    let given = pods_as_given(context, namespace);
     for (number, name) in &plan.make {
         let pod = build::pod(job, &context.config, &running.storage, &held, &trusted, *number, name)
             .map_err(|e| Error::Internal(e.to_string()))?;
         let params = PatchParams::apply(MANAGER);
-        let made = pods.patch(name, &params, &Patch::Apply(&pod)).await.map_err(api("make a worker's pod"))?;
+        let made = given.patch(name, &params, &Patch::Apply(&pod)).await.map_err(api("make a worker's pod"))?;
         if let Some(uid) = made.metadata.uid {
             running.lock().pods.insert(uid, *number);
         }
     }
     Ok(())
+}
+
+/// Pods as JSON: what a job's template says of them goes to the API server as it is, which knows what is right.
+fn pods_as_given(context: &Context, namespace: &str) -> Api<DynamicObject> {
+    Api::namespaced_with(context.client.clone(), namespace, &ApiResource::erase::<Pod>(&()))
+}
+
+/// Has the API server look at a worker's pod without making it.
+async fn try_pod(job: &RenderJobObject, context: &Context, namespace: &str, storage: &Storage) -> Result<(), Error> {
+    // a name that none of ours has: nothing is made
+    let name = format!("{}-template", job.name_any());
+    let pod = build::pod(job, &context.config, storage, &BTreeMap::new(), "", 0, &name);
+    let pod = pod.map_err(|e| Error::Internal(e.to_string()))?;
+    let params = PatchParams { field_validation: Some(ValidationDirective::Strict), ..PatchParams::apply(MANAGER) };
+    match pods_as_given(context, namespace).patch(&name, &params.dry_run().force(), &Patch::Apply(&pod)).await {
+        Ok(_) => Ok(()),
+        // a field that there is not is refused with 500
+        Err(kube::Error::Api(e)) if matches!(e.code, 400 | 403 | 422) || e.message.contains("typed patch") => {
+            Err(Error::Template(format!(
+                "spec.workers.template does not make a pod that the API server takes: {}",
+                e.message
+            )))
+        }
+        Err(e) => Err(api("try a worker's pod")(e)),
+    }
 }
 
 async fn list_pods(pods: &Api<Pod>, uid: &str) -> Result<Vec<Pod>, Error> {

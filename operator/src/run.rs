@@ -2,11 +2,13 @@
 
 use std::sync::Arc;
 use std::thread;
+use std::time::Duration;
 
 use k8s_openapi::jiff::Timestamp;
 use kube::Client;
 use rayherd_api::ByteSize;
 use rayherd_api::resource::RenderJobObject;
+use rayherd_herd::job::spec::scene_settings;
 use rayherd_herd::job::{JobError, Progress, Status};
 use rayherd_herd::remote::frames::{Job, Keeper, run};
 use rayherd_herd::remote::{Depot, Fleet, Storage, Turns};
@@ -17,6 +19,9 @@ use tokio::runtime::Handle;
 use crate::build;
 use crate::jobs::{Problem, Running, State};
 use crate::ledger::Ledger;
+
+/// A store that is silent for so long is lost, and what lies on it is copied again: longer than a server takes to start anew.
+const LOST: Duration = Duration::from_secs(15);
 
 /// Where a job's own objects are.
 pub fn prefix(uid: &str) -> String {
@@ -41,22 +46,34 @@ pub fn pictures(job: &RenderJobObject) -> Vec<String> {
     numbered.collect()
 }
 
-/// Starts a job.
+/// The manifest of a job's scene, if the status has one of the settings as they are now.
+pub fn known_scene(job: &RenderJobObject) -> Option<String> {
+    let status = job.status.as_ref()?;
+    let settings = status.scene_settings.as_ref()?;
+    status.scene.clone().filter(|_| *settings == scene_settings(&job.spec))
+}
+
+/// Starts a job. `before` is the run of an earlier spec whose workers it takes over.
 pub fn start(
     client: Client,
     job: Arc<RenderJobObject>,
     storage: Storage,
     depot: Depot,
     turns: Arc<Turns>,
+    before: Option<&Running>,
 ) -> Arc<Running> {
     let nanos = Timestamp::now().as_nanosecond();
     let slots = build::slots(&job);
     let session = format!("o{nanos:x}");
+    let known = known_scene(&job);
+    let (pods, held) = before.map(|b| b.lock()).map(|b| (b.pods.clone(), b.held.clone())).unwrap_or_default();
+    let begun = State { started: Some(Timestamp::now()), known: known.is_some(), pods, held, ..State::default() };
     let running = Arc::new(Running {
         generation: job.metadata.generation.unwrap_or(0),
+        spec: job.spec.clone(),
         fleet: Fleet::new(slots.len() as u32, &session),
         storage,
-        state: State { started: Some(Timestamp::now()), ..State::default() }.into(),
+        state: begun.into(),
     });
     let keeper = Kept { ledger: Ledger::new(client, &job, Handle::current()), running: running.clone() };
     let runtime = Handle::current();
@@ -68,6 +85,8 @@ pub fn start(
         let task = Job {
             spec: &spec,
             pictures: pictures(&job),
+            known,
+            patience: LOST,
             prefix: prefix(job.metadata.uid.as_deref().unwrap_or_default()),
             session,
             depot: &depot,
@@ -80,12 +99,18 @@ pub fn start(
         let watch = Watch(of_thread.clone(), job.metadata.name.clone().unwrap_or_default());
         let caught = std::panic::catch_unwind(std::panic::AssertUnwindSafe(|| run(&task, &keeper, &watch)));
         let result = caught.unwrap_or_else(|_| Err(JobError::Internal("the job's thread panicked".into())));
-        let result = result.map_err(|e| Problem { stopped: matches!(e, JobError::Owned(_)), message: e.to_string() });
+        // stores that do not answer the operator for now may do so soon: nothing is wrong with the job either
+        let stopped = |e: &JobError| matches!(e, JobError::Owned(_)) || e.may_pass();
+        let result = result.map_err(|e| Problem { stopped: stopped(&e), message: e.to_string() });
         if let Err(problem) = &result {
             tracing::warn!(job = %job.metadata.name.clone().unwrap_or_default(), "{}", problem.message);
         }
-        // workers of a job that was stopped wait for whoever goes on with it
-        if result.as_ref().is_ok_and(|()| true) || result.as_ref().is_err_and(|p| !p.stopped) {
+        // workers of a job that was stopped wait for whoever goes on with it, those that are kept warm for more samples
+        let stay = match &result {
+            Ok(()) => build::keep_warm(&job).is_some(),
+            Err(problem) => problem.stopped,
+        };
+        if !stay {
             of_thread.fleet.end();
         }
         of_thread.lock().end = Some((Timestamp::now(), result));
@@ -113,8 +138,12 @@ impl Keeper for Kept {
         let mut state = self.running.lock();
         (state.scene, state.reused) = (Some(scene.hash.to_string()), reused);
     }
+    fn below(&self, what: Option<&str>) {
+        self.running.lock().below = what.map(str::to_owned);
+    }
     fn placed(&self, bytes: &[u64]) {
         let mut state = self.running.lock();
+        state.held.clear();
         for (endpoint, bytes) in self.running.storage.endpoints.iter().zip(bytes) {
             if let Some(node) = &endpoint.node {
                 *state.held.entry(node.clone()).or_default() += bytes;

@@ -5,6 +5,7 @@ use std::time::Duration;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::{Condition, Time};
 use k8s_openapi::jiff::{SignedDuration, Timestamp};
 use rayherd_api::resource::{RenderJobObject, RenderJobStatus};
+use rayherd_herd::job::spec::scene_settings;
 use rayherd_herd::remote::fleet::Tally;
 use rayherd_herd::report::{Kind, Op, Place};
 
@@ -69,6 +70,18 @@ pub fn deadline(job: &RenderJobObject) -> Option<Timestamp> {
     start.checked_add(SignedDuration::from_secs(seconds)).ok()
 }
 
+/// How much longer the workers of a job that came to its end are kept.
+pub fn warm(job: &RenderJobObject, now: Timestamp) -> Option<Duration> {
+    let status = job.status.as_ref()?;
+    let complete = status.phase.as_deref() == Some("Complete");
+    let seconds = job.spec.workers.keep_warm_seconds.filter(|_| complete)?;
+    let Time(end) = status.completion_time.as_ref()?;
+    let until = end.checked_add(SignedDuration::from_secs(seconds)).ok()?;
+    let left = Duration::try_from(until.duration_since(now)).ok().filter(|d| !d.is_zero())?;
+    // one that is deleted before takes them along
+    Some(stays(job, now).map_or(left, |stays| stays.min(left))).filter(|d| !d.is_zero())
+}
+
 /// How long a job that came to its end stays; none for ever.
 pub fn stays(job: &RenderJobObject, now: Timestamp) -> Option<Duration> {
     let seconds = job.spec.ttl_seconds_after_finished?;
@@ -85,7 +98,7 @@ pub fn news<'s>(known: Option<&RenderJobStatus>, status: &'s RenderJobStatus) ->
     };
     let has_failed = status.phase.as_deref() == Some("Failed");
     let telling = |c: &&Condition| match (c.type_.as_str(), c.status.as_str()) {
-        ("Prepared" | "Suspended" | "Complete" | "Failed", "True") => true,
+        ("Prepared" | "Degraded" | "Suspended" | "Complete" | "Failed", "True") => true,
         // what fails says so once
         ("Accepted", "False") => !has_failed,
         _ => false,
@@ -138,20 +151,34 @@ fn of(
     status.cpu_seconds = Some(tally.cpu as i64);
     let ready = if matches!(phase, "Complete" | "Failed") { 0 } else { tally.ready };
     status.workers = Some(format!("{ready}/{wanted}"));
-    status.scene = state.scene.clone().or(status.scene);
+    if let Some(scene) = &state.scene {
+        status.scene = Some(scene.clone());
+        status.scene_settings = Some(scene_settings(&job.spec));
+    }
     status.locality = Some(if local { "per node" } else { "none" }.into());
     // one that was at its end begins anew
-    let began = status.start_time.filter(|_| status.completion_time.is_none());
-    status.start_time = began.or(state.started.map(Time));
-    status.first_task_time = status.first_task_time.or(state.first_task.map(Time));
+    let goes_on = status.completion_time.is_none();
+    status.start_time = status.start_time.filter(|_| goes_on).or(state.started.map(Time));
+    status.first_task_time = status.first_task_time.filter(|_| goes_on).or(state.first_task.map(Time));
+    if !state.reports.is_empty() {
+        status.tasks_redone = Some(state.reports.iter().map(|r| r.tasks_redone).sum::<u64>() as i64);
+    }
     if !state.pictures.is_empty() {
         status.pictures.clone_from(&state.pictures);
     }
     set(job, &mut status, "Accepted", "True", "Valid", "the job can run", now);
-    if state.scene.is_some() {
+    let has = |kind: &str| status.conditions.iter().any(|c| c.type_ == kind && c.status == "True");
+    if state.scene.is_some() && !(state.known && has("Prepared")) {
         let (reason, message) =
             if state.reused { ("Found", "the scene was prepared before") } else { ("Made", "the scene was prepared") };
         set(job, &mut status, "Prepared", "True", reason, message, now);
+    }
+    match &state.below {
+        Some(what) => set(job, &mut status, "Degraded", "True", "StoreSilent", what, now),
+        None if status.conditions.iter().any(|c| c.type_ == "Degraded") => {
+            set(job, &mut status, "Degraded", "False", "Copied", "there are enough copies again", now);
+        }
+        None => {}
     }
     if status.conditions.iter().any(|c| c.type_ == "Suspended") {
         set(job, &mut status, "Suspended", "False", "Resumed", "", now);

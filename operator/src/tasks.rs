@@ -26,7 +26,7 @@ use crate::tls::{Current, Tls};
 /// Between two looks whether the certificate is to be renewed.
 const HOUR: Duration = Duration::from_secs(3600);
 /// How long a question stays open: below what proxies cut.
-const PATIENCE: Duration = Duration::from_secs(20);
+const PATIENCE: Duration = Duration::from_secs(12);
 /// How long a reviewed token is believed: a pod that is deleted is heard no longer than this.
 const BELIEF: Duration = Duration::from_secs(30);
 /// Most bytes of a report: it names what a task made.

@@ -14,9 +14,10 @@ use ureq::tls::{PemItem, RootCerts, TlsConfig, TlsProvider, parse_pem};
 
 use crate::config::Config;
 
-/// Longer than the operator keeps a question open.
-const POLL: Duration = Duration::from_secs(40);
+/// Longer than the operator keeps a question open; a machine that is gone costs no more than this.
+const POLL: Duration = Duration::from_secs(20);
 const ANSWER: Duration = Duration::from_secs(15);
+const CONNECT: Duration = Duration::from_secs(4);
 /// Most bytes of an answer: a task names its groups and camera units.
 const MOST: u64 = 64 << 20;
 
@@ -49,7 +50,7 @@ impl Http {
         let builder = Agent::config_builder()
             .http_status_as_error(false)
             .https_only(true)
-            .timeout_connect(Some(ANSWER))
+            .timeout_connect(Some(CONNECT))
             .tls_config(tls);
         let base = format!("{}/v1/jobs/{}", config.operator, config.job);
         Ok(Http { agent: builder.build().into(), base, token: config.token.clone() })

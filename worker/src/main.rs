@@ -49,7 +49,7 @@ fn run() -> anyhow::Result<()> {
                 }
                 if station.is_idle() {
                     // slots may still wait for an answer to a question that does not matter any more
-                    std::process::exit(0);
+                    std::process::exit(i32::from(station.has_panicked()));
                 }
             }
         })?;

@@ -4,10 +4,13 @@ mod check;
 mod compare;
 mod gc;
 mod inspect;
+mod jobs;
+mod logs;
 mod prepare;
 mod render;
 mod replay;
 mod scene;
+mod submit;
 
 use std::io::Write;
 use std::process::ExitCode;
@@ -27,6 +30,9 @@ pub enum Command {
     Replay(Box<replay::Arguments>),
     Gc(gc::Arguments),
     Scene(scene::Arguments),
+    Submit(Box<submit::Arguments>),
+    Jobs(jobs::Arguments),
+    Logs(logs::Arguments),
 }
 
 /// Does it. The code is the command's answer; an error is told by the caller.
@@ -40,6 +46,9 @@ pub fn run(command: Command) -> anyhow::Result<ExitCode> {
         Command::Inspect(arguments) => inspect::run(&arguments),
         Command::Check(arguments) => check::run(&arguments),
         Command::Prepare(arguments) => prepare::run(&arguments),
+        Command::Submit(arguments) => submit::run(&arguments),
+        Command::Jobs(arguments) => jobs::run(&arguments),
+        Command::Logs(arguments) => logs::run(&arguments),
     }
 }
 

@@ -23,11 +23,15 @@ impl<F: FilmSum> Driver<'_, '_, F> {
         let set = match plan.set {
             Set::Resident(ranks) => {
                 self.hold(plan.node, &ranks);
+                self.remember(plan.node, &ranks);
                 let mut splits: Vec<u32> = ranks.into_iter().map(|r| self.order[r as usize]).collect();
                 splits.sort_unstable();
                 Set::Resident(splits)
             }
-            Set::Sharing(rank) => Set::Sharing(self.order[rank as usize]),
+            Set::Sharing(rank) => {
+                self.remember(plan.node, &[rank]);
+                Set::Sharing(self.order[rank as usize])
+            }
             other => other,
         };
         let (task, groups) = self.ledger.start(&Inputs { groups, camera: camera.clone() })?;

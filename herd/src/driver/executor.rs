@@ -8,6 +8,9 @@ use crate::local::attempt::{Attempt, Made};
 use crate::local::slots::StopFlag;
 use crate::report::Bytes;
 
+/// Objects by name, with the nodes that hold them.
+pub type Objects = Vec<(String, Vec<u32>)>;
+
 /// An attempt to start.
 pub struct Launch {
     /// Of which task.
@@ -42,6 +45,8 @@ pub enum Event {
     NodeLost(u32),
     /// A node has lost what it held in memory.
     MemoryLost(u32),
+    /// A store is silent, and has been for so long that what lay on it is to be copied again.
+    StoreLost(u32),
 }
 
 /// Where tasks run.
@@ -51,6 +56,21 @@ pub trait Executor {
     /// Nodes next to a copy of each split, where the executor knows better than the job's own nodes.
     fn holders(&self) -> Option<Vec<Vec<u32>>> {
         None
+    }
+    /// Copies objects that lie on a store which is silent, from the copies that are left; where they lie now.
+    ///
+    /// # Errors
+    /// When nothing can be copied.
+    fn copy_again(&self, _objects: Objects, _gone: u32) -> Result<Objects, JobError> {
+        Ok(Vec::new())
+    }
+    /// What else lay on that store, the scene and the records, is copied again. Of the rays and film, so many have too few copies all
+    /// the same.
+    ///
+    /// # Errors
+    /// When nothing can be copied.
+    fn restore(&self, _gone: u32, _few: usize) -> Result<(), JobError> {
+        Ok(())
     }
     /// Whether one more attempt would compute at once.
     fn has_room(&self) -> bool;
@@ -84,6 +104,12 @@ pub trait FilmSum {
     /// # Errors
     /// When the sum cannot be had.
     fn rel_mse(&mut self, spp: u32) -> Result<Option<f64>, JobError>;
+    /// Stored objects that lie on a store.
+    fn on_store(&self, _store: u32) -> Objects {
+        Vec::new()
+    }
+    /// An object lies elsewhere now.
+    fn relocate(&mut self, _name: &str, _holders: &[u32]) {}
     /// Whether a stored object is still needed.
     fn needs(&self, name: &str) -> bool;
     /// The error of the sum as it is, about, for whoever watches: only where it costs little.

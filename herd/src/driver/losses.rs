@@ -1,6 +1,6 @@
 //! What is done when nodes, copies or rays are lost.
 
-use super::{Driver, FilmSum, Objects};
+use super::{Driver, Executor, FilmSum, Objects};
 use crate::job::JobError;
 use crate::ledger::Outputs;
 use crate::report::Kind;
@@ -35,7 +35,7 @@ impl<F: FilmSum> Driver<'_, '_, F> {
     /// A node is gone with its disk and what ran on it, and comes back empty. What has other copies is copied again.
     pub(super) fn lose_node(&mut self, node: u32) -> Result<(), JobError> {
         let nodes = &self.shared.nodes;
-        self.windows[node as usize].clear();
+        self.forget(node);
         self.live.values().filter(|l| l.node == node).for_each(|l| l.stop.set());
         for group in self.ledger.snapshot(None).waiting {
             if group.holders.contains(&node) {
@@ -48,6 +48,25 @@ impl<F: FilmSum> Driver<'_, '_, F> {
             self.write_snapshot()?;
         }
         Ok(())
+    }
+
+    /// A store is silent. What lay on it is copied again from where else it lies, so that another loss costs no work.
+    pub(super) fn lose_copies(&mut self, executor: &dyn Executor, store: u32) -> Result<(), JobError> {
+        let waiting = self.ledger.snapshot(None).waiting;
+        let groups = waiting.into_iter().filter(|g| g.holders.contains(&store)).map(|g| (g.key, g.holders));
+        let objects: Objects = groups.chain(self.film.on_store(store)).collect();
+        let (lay, copies) = (objects.len(), self.shared.settings.replicas as usize);
+        let now = if objects.is_empty() { objects } else { executor.copy_again(objects, store)? };
+        let few = lay - now.iter().filter(|(_, holders)| holders.len() >= copies).count();
+        for (name, holders) in now {
+            self.film.relocate(&name, &holders);
+            self.ledger.relocate(&name, holders);
+        }
+        if self.is_durable() {
+            // whoever goes on from here finds the copies
+            self.write_snapshot()?;
+        }
+        executor.restore(store, few)
     }
 
     /// Deletes what an attempt made that does not count.

@@ -25,7 +25,7 @@ use crate::plan::cost::Traffic;
 use crate::plan::rate::Rate;
 use crate::report::RayCounts;
 use cameras::Cameras;
-pub use executor::{Event, Executor, FilmSum, Finished, Launch, Pointer};
+pub use executor::{Event, Executor, FilmSum, Finished, Launch, Objects, Pointer};
 
 /// Where a job begins: at nothing, or where an earlier run stopped.
 pub struct Start<F> {
@@ -58,9 +58,6 @@ struct Live {
     stop: StopFlag,
 }
 
-/// Objects by name, with the nodes that hold them.
-type Objects = Vec<(String, Vec<u32>)>;
-
 /// The loop over rounds of one frame.
 pub struct Driver<'s, 'a, F> {
     shared: &'s Shared<'a>,
@@ -79,6 +76,8 @@ pub struct Driver<'s, 'a, F> {
     /// In how many parts the cut divides the scene.
     parts: f64,
     windows: Vec<BTreeSet<u32>>,
+    /// Where tasks run on other machines: what each node was given last, as far as its memory holds it, the newest at the end.
+    recent: Vec<Vec<u32>>,
     traffic: Traffic,
     free: Vec<u32>,
     running: BTreeMap<TaskId, Running>,
@@ -138,6 +137,7 @@ impl<'s, 'a, F: FilmSum> Driver<'s, 'a, F> {
             cut: None,
             parts: 1.0,
             windows: vec![BTreeSet::new(); shared.settings.nodes.len()],
+            recent: vec![Vec::new(); shared.settings.nodes.len()],
             traffic: Traffic::default(),
             free: shared.settings.nodes.iter().map(|n| n.slots).collect(),
             running: BTreeMap::new(),
@@ -196,7 +196,8 @@ impl<'s, 'a, F: FilmSum> Driver<'s, 'a, F> {
                 Some(Event::Finished(finished)) => self.handle(*finished)?,
                 Some(Event::NodeLost(node)) => self.lose_node(node)?,
                 // what it is planned to hold must be loaded again, by whoever is nearest
-                Some(Event::MemoryLost(node)) => self.windows[node as usize].clear(),
+                Some(Event::MemoryLost(node)) => self.forget(node),
+                Some(Event::StoreLost(store)) => self.lose_copies(executor, store)?,
                 None => {}
             }
             self.tell();

@@ -15,7 +15,10 @@ impl<F: FilmSum> Driver<'_, '_, F> {
             return Vec::new();
         }
         let settings = self.shared.settings;
-        let holders = executor.holders().unwrap_or_else(|| self.shared.nodes.holders());
+        let holders = executor.holders();
+        // on machines of their own nodes' memories cannot be looked into
+        let elsewhere = holders.is_some();
+        let holders = holders.unwrap_or_else(|| self.shared.nodes.holders());
         let split =
             |&s: &u32| SplitView { bytes: self.shared.scene.split_bytes(s), holders: holders[s as usize].clone() };
         let splits: Vec<SplitView> = self.order.iter().map(split).collect();
@@ -34,7 +37,7 @@ impl<F: FilmSum> Driver<'_, '_, F> {
         let mut view = View {
             strategy: settings.strategy,
             splits: &splits,
-            nodes: &self.nodes_as_seen(executor),
+            nodes: &self.nodes_as_seen(executor, elsewhere),
             waiting,
             reduce,
             camera: self.cameras.rays(),
@@ -71,12 +74,14 @@ impl<F: FilmSum> Driver<'_, '_, F> {
     }
 
     /// The nodes as the planner sees them.
-    fn nodes_as_seen(&self, executor: &dyn Executor) -> Vec<NodeView> {
+    fn nodes_as_seen(&self, executor: &dyn Executor, elsewhere: bool) -> Vec<NodeView> {
         let settings = self.shared.settings;
         let node = |(n, spec): (usize, &NodeSpec)| {
             let memory = self.shared.nodes.memory(n as u32);
             let warm = if settings.strategy == plan::Strategy::Auto {
                 self.windows[n].clone()
+            } else if elsewhere {
+                self.recent[n].iter().copied().collect()
             } else {
                 memory.warm().into_iter().map(|s| self.rank[s as usize]).collect()
             };
@@ -84,6 +89,26 @@ impl<F: FilmSum> Driver<'_, '_, F> {
             NodeView { slots: up(spec.slots), free: up(self.free[n]), memory: memory.capacity(), warm }
         };
         settings.nodes.iter().enumerate().map(node).collect()
+    }
+
+    /// Remembers that a node was given splits: the oldest go when its memory does not hold all, as they do there.
+    pub(super) fn remember(&mut self, node: u32, ranks: &[u32]) {
+        let (scene, order) = (self.shared.scene, &self.order);
+        let held = &mut self.recent[node as usize];
+        held.retain(|r| !ranks.contains(r));
+        held.extend(ranks);
+        let bytes = |r: &u32| scene.split_bytes(order[*r as usize]);
+        let mut sum: u64 = held.iter().map(bytes).sum();
+        let capacity = self.shared.nodes.memory(node).capacity();
+        while sum > capacity && held.len() > ranks.len() {
+            sum -= bytes(&held.remove(0));
+        }
+    }
+
+    /// A node has lost what it held.
+    pub(super) fn forget(&mut self, node: u32) {
+        self.windows[node as usize].clear();
+        self.recent[node as usize].clear();
     }
 
     /// Remembers the window that a node of `auto` is to hold: beside what it holds if there is room, else instead of it.

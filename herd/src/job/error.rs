@@ -102,6 +102,11 @@ pub enum JobError {
 }
 
 impl JobError {
+    /// Whether it may pass by itself: a store that does not answer for now.
+    pub fn may_pass(&self) -> bool {
+        matches!(self, JobError::Store(StoreError::Unavailable { .. }) | JobError::Object(ObjectError::Failed { .. }))
+    }
+
     /// Whether other settings, another scene or another store would help: exit code 2. Otherwise it is ours, the machine's
     /// or the network's: exit code 1.
     pub fn is_users(&self) -> bool {

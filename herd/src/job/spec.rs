@@ -57,6 +57,19 @@ pub fn prepare_settings(spec: &RenderJobSpec) -> PrepareSettings {
     PrepareSettings { cut, overlap_reduction, overlap_threshold, ..defaults }
 }
 
+/// Names what the prepared scene of a job depends on, but for the source's content: two jobs of one name and an unchanged source
+/// have one prepared scene.
+pub fn scene_settings(spec: &RenderJobSpec) -> String {
+    let settings = json!({
+        "scene": spec.scene,
+        "size": spec.image.size,
+        "cut": prepare_settings(spec),
+        "storage": spec.storage,
+        "replicas": spec.replicas,
+    });
+    blake3::hash(settings.to_string().as_bytes()).to_hex()[..32].to_owned()
+}
+
 /// Samples per pixel: the job's, the scene's, or the default.
 pub fn samples(spec: &RenderJobSpec, manifest: &Manifest) -> u32 {
     spec.sampling.spp.map(|n| n as u32).or(manifest.defaults.spp).unwrap_or(DEFAULT_SPP)

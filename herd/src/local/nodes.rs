@@ -15,7 +15,7 @@ use crate::job::{JobError, JobSettings, PreparedScene};
 use crate::plan::place;
 use crate::report::{Bytes, Kind, NodeReport, Op, Place, Stage};
 use crate::resident::{Blocks, Memory};
-use crate::store::{BlockStore, StoreError};
+use crate::store::{BlockStore, StoreError, kind_of_key};
 use crate::textures::{TileCache, Tiles, tile_holders, tile_of};
 use crate::wire::WireError;
 
@@ -253,6 +253,35 @@ impl<'a> Nodes<'a> {
             left.push(to);
         }
         Ok(left)
+    }
+
+    /// Copies an object that lies on a store which is silent to others that take it, until there are enough; who holds it then. None if
+    /// no copy can be had. What is copied is checked by whoever reads it.
+    ///
+    /// # Errors
+    /// When a store refuses for good.
+    pub fn copy_elsewhere(&self, name: &str, holders: &[u32], gone: u32) -> Result<Option<Vec<u32>>, JobError> {
+        let mut left: Vec<u32> = holders.iter().copied().filter(|&h| h != gone).collect();
+        let found = left.iter().find_map(|&h| Some((h, self.wait(self.store.get(&disk_key(h, name))).ok()?)));
+        let Some((from, body)) = found else { return Ok(None) };
+        let enough = self.replicas.min(self.keepers) as usize;
+        for to in (1..self.keepers).map(|k| (gone + k) % self.keepers) {
+            if left.len() >= enough {
+                break;
+            }
+            if left.contains(&to) {
+                continue;
+            }
+            match self.wait(self.store.put(&disk_key(to, name), body.clone())) {
+                Ok(()) => {
+                    self.count(Stage::Trace, Op::Write, kind_of_key(name), from, Place::Remote, body.len() as u64);
+                    left.push(to);
+                }
+                Err(e @ (StoreError::Unavailable { .. } | StoreError::Full { .. })) => tracing::warn!("{e}"),
+                Err(e) => return Err(e.into()),
+            }
+        }
+        Ok(Some(left))
     }
 
     /// Changes a byte of a copy, for tests.

@@ -17,7 +17,6 @@ use super::{JobOutcome, check, journal};
 use crate::driver::{Driver, Pointer, Start};
 use crate::job::{JobError, JobSettings, PreparedScene, Progress, Sampling};
 use crate::ledger::Ledger;
-use crate::report::SampleKey;
 use crate::store::{BlockStore, Spilling};
 use crate::task::camera::tiles;
 
@@ -172,10 +171,6 @@ fn rounds(
     }
     let (film, spp, mut report) = driver.finish()?;
     let film = film.into_sum();
-    for &(pixel, sample) in &film.rejected().keys {
-        let [x, y] = [pixel % film.size()[0], pixel / film.size()[0]];
-        tracing::warn!("pixel {x},{y} sample {sample}: a contribution is not finite or too large");
-        report.non_finite_at.push(SampleKey { pixel: [x, y], sample });
-    }
+    report.note_non_finite(film.size()[0], &film.rejected().keys);
     Ok(JobOutcome { image: image(&film, spp), film, spp, report })
 }

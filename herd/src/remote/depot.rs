@@ -1,19 +1,22 @@
 //! The stores of a cluster's nodes, as one of its machines sees them.
 
 use std::sync::Arc;
+use std::time::Duration;
 
 use async_trait::async_trait;
 use bytes::Bytes;
 
 use crate::job::JobError;
 use crate::local::nodes::disk_key;
-use crate::store::{BlockStore, NodeView, Prefixed, Replicated, StoreError};
+use crate::store::{BlockStore, NodeView, Prefixed, Replicated, StoreError, Watched};
 
 /// All stores, numbered; one of them may be on this machine.
 #[derive(Clone)]
 pub struct Depot {
     stores: Vec<Arc<dyn BlockStore>>,
     home: Option<u32>,
+    /// The stores again, where their machines are watched.
+    watched: Vec<Arc<Watched>>,
 }
 
 impl Depot {
@@ -25,7 +28,27 @@ impl Depot {
         if stores.is_empty() {
             return Err(JobError::Settings("the storage has no endpoint: name one, or wait until its pods run".into()));
         }
-        Ok(Depot { home: home.filter(|&h| (h as usize) < stores.len()), stores })
+        Ok(Depot { home: home.filter(|&h| (h as usize) < stores.len()), stores, watched: Vec::new() })
+    }
+
+    /// From stores that are watched: one whose machine is silent costs no waiting.
+    ///
+    /// # Errors
+    /// When there is none.
+    pub fn watched(stores: Vec<Arc<Watched>>, home: Option<u32>) -> Result<Self, JobError> {
+        let plain = stores.iter().map(|s| s.clone() as Arc<dyn BlockStore>).collect();
+        Ok(Depot { watched: stores, ..Depot::new(plain, home)? })
+    }
+
+    /// Stores whose machines are known to be silent for at least so long.
+    pub fn silent(&self, least: Duration) -> Vec<u32> {
+        let silent = |s: &Arc<Watched>| s.silent_for().is_some_and(|t| t >= least);
+        (0..).zip(&self.watched).filter(|(_, s)| silent(s)).map(|(n, _)| n).collect()
+    }
+
+    /// Looks, where it is time to, whether machines that were silent are back.
+    pub async fn look(&self) {
+        futures::future::join_all(self.watched.iter().map(|s| s.look())).await;
     }
 
     /// Number of stores.
@@ -56,7 +79,7 @@ impl Depot {
     pub fn part(&self, prefix: &str, copies: u32) -> Result<Part, StoreError> {
         let below = |s: &Arc<dyn BlockStore>| Ok(Arc::new(Prefixed::new(s.clone(), prefix)?) as Arc<dyn BlockStore>);
         let stores: Vec<Arc<dyn BlockStore>> = self.stores.iter().map(below).collect::<Result<_, StoreError>>()?;
-        let shared = Depot { stores: stores.clone(), home: self.home }.replicated(copies)?;
+        let shared = Depot { stores: stores.clone(), home: self.home, watched: Vec::new() }.replicated(copies)?;
         Ok(Part { stores, shared })
     }
 }
@@ -71,6 +94,11 @@ pub struct Part {
 type Alone<'s, 'k> = (&'s Arc<dyn BlockStore>, &'k str);
 
 impl Part {
+    /// What lies on no store alone.
+    pub fn shared(&self) -> &NodeView {
+        &self.shared
+    }
+
     /// The store that a key lies on alone, and its key there.
     fn alone<'k>(&self, key: &'k str) -> Result<Option<Alone<'_, 'k>>, StoreError> {
         let Some((number, rest)) = key.strip_prefix("nodes/").and_then(|k| k.split_once('/')) else { return Ok(None) };

@@ -20,8 +20,10 @@ use crate::report::Bytes;
 
 /// A worker that is silent for so long is gone. It beats each second.
 pub const SILENCE: Duration = Duration::from_secs(10);
-/// So many failures one after the other, that may pass by themselves, are too many.
+/// So many failures one after the other, that may pass by themselves, are too many, if they have gone on for [`PATIENCE`]: a server that
+/// starts anew, or stores that are silent together for a moment, cost no job.
 const MOST_FAILURES: u32 = 30;
+const PATIENCE: Duration = Duration::from_secs(60);
 
 /// The workers of one job.
 pub struct Fleet {
@@ -48,11 +50,15 @@ struct State {
     /// Workers that went away since this was told last.
     emptied: BTreeSet<u32>,
     answers: BTreeMap<u64, Result<Done, Failure>>,
+    /// Since the last success.
     failures: u32,
+    failing: Option<Instant>,
     bytes: Bytes,
     cpu: f64,
     first_attempt: Option<Instant>,
     over: bool,
+    /// Another fleet has the workers now.
+    retired: bool,
     cancelled: Option<String>,
 }
 
@@ -116,6 +122,11 @@ impl Fleet {
         self.lock().over = true;
         self.wanted.notify_waiters();
     }
+    /// Workers go over to another fleet, which answers them from now on: whoever waits here for an answer is to ask again.
+    pub fn retire(&self) {
+        self.lock().retired = true;
+        self.wanted.notify_waiters();
+    }
     /// The job is to end now, with this message.
     pub fn cancel(&self, why: &str) {
         self.lock().cancelled = Some(why.to_owned());
@@ -164,7 +175,7 @@ impl Fleet {
             tokio::pin!(wanted);
             wanted.as_mut().enable();
             let answer = self.answer(poll)?;
-            if answer != Answer::Wait || tokio::time::timeout_at(end, wanted).await.is_err() {
+            if answer != Answer::Wait || self.lock().retired || tokio::time::timeout_at(end, wanted).await.is_err() {
                 return Ok(answer);
             }
         }
@@ -228,14 +239,13 @@ impl Fleet {
             }
             // another worker may do it
             (What::Call { call, work }, Err(Failure::Stopped)) => state.common.push_front((call, work)),
-            (What::Call { call, work }, Err(Failure::ForNow { message })) if state.failures < MOST_FAILURES => {
+            (What::Call { call, work }, Err(Failure::ForNow { message })) if state.may_pass() => {
                 tracing::warn!("{message}; trying again");
-                state.failures += 1;
                 state.common.push_back((call, work));
             }
             (What::Call { call, .. }, result) => {
                 if result.is_ok() {
-                    state.failures = 0;
+                    state.succeeded();
                 }
                 state.answers.insert(call, result);
             }
@@ -363,6 +373,16 @@ impl State {
         !gone.is_empty()
     }
 
+    /// Counts a failure that may pass by itself; whether that is still to be hoped for.
+    fn may_pass(&mut self) -> bool {
+        self.failures += 1;
+        let since = *self.failing.get_or_insert_with(Instant::now);
+        self.failures <= MOST_FAILURES || since.elapsed() < PATIENCE
+    }
+    fn succeeded(&mut self) {
+        (self.failures, self.failing) = (0, None);
+    }
+
     fn check(&self) -> Result<(), JobError> {
         self.cancelled.as_ref().map_or(Ok(()), |why| Err(JobError::Owned(why.clone())))
     }
@@ -371,15 +391,14 @@ impl State {
     fn judge(&mut self, result: Result<Done, Failure>) -> Result<Made, JobError> {
         match result {
             Ok(Done::Made { outputs, hops }) => {
-                self.failures = 0;
+                self.succeeded();
                 Ok(Made { outputs, film: FilmPart::new(self.size), hops })
             }
             Ok(_) => Err(JobError::Internal("a worker reports something else than it was to do".into())),
             Err(Failure::Stopped) => Err(JobError::Stopped),
             Err(Failure::Lost { name, why }) => Err(JobError::Lost { name, why }),
-            Err(Failure::ForNow { message }) if self.failures < MOST_FAILURES => {
+            Err(Failure::ForNow { message }) if self.may_pass() => {
                 tracing::warn!("{message}; trying again");
-                self.failures += 1;
                 Err(JobError::Stopped)
             }
             Err(Failure::ForNow { message } | Failure::ForGood { message }) => Err(JobError::Settings(message)),

@@ -3,11 +3,12 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use rayherd_api::RenderJobSpec;
+use rayherd_api::{Placement, RenderJobSpec};
 use rayherd_scene::manifest::Manifest;
 use rayherd_scene::objects::{ObjectRef, ObjectStore};
 use tokio::runtime::Handle;
 
+use super::guard::Guard;
 use super::message::{Done, Stage, Work};
 use super::parts::Parts;
 use super::{Depot, Fleet, Turns};
@@ -18,7 +19,7 @@ use crate::local::attempt::Shared;
 use crate::local::journal;
 use crate::local::nodes::{Nodes, placement};
 use crate::report;
-use crate::store::SceneObjects;
+use crate::store::{BlockStore, SceneObjects, StoreError, object_key};
 
 /// How long the first plan of a frame waits for workers that are not there yet.
 const GATHER: Duration = Duration::from_secs(3);
@@ -36,6 +37,8 @@ pub trait Keeper: Send + Sync {
     fn prepared(&self, scene: &ObjectRef, reused: bool);
     /// Which nodes' stores hold the scene: bytes by store.
     fn placed(&self, bytes: &[u64]);
+    /// Of something there are fewer copies than asked for; none: there are enough (again).
+    fn below(&self, what: Option<&str>);
     /// A frame is done.
     fn done(&self, frame: u32, picture: &[String], report: &report::Report);
 }
@@ -46,6 +49,10 @@ pub struct Job<'a> {
     pub spec: &'a RenderJobSpec,
     /// Names of the pictures: one for each frame.
     pub pictures: Vec<String>,
+    /// Hash of the manifest of the scene as these settings prepare it, if that is known: then the source need not be read.
+    pub known: Option<String>,
+    /// A store that is silent for so long is lost: what lies on it is copied again.
+    pub patience: Duration,
     /// Where its own objects are in each store.
     pub prefix: String,
     /// Names this run of the operator; objects of another run never have its names.
@@ -69,13 +76,10 @@ pub struct Job<'a> {
 pub fn run(job: &Job, keeper: &Arc<dyn Keeper>, progress: &dyn Progress) -> Result<(), JobError> {
     let spec = job.spec;
     let replicas = spec.replicas.map_or(1, |r| r as u32).clamp(1, job.depot.len());
-    let prepare = Work::Prepare { spec: Box::new(spec.clone()), replicas };
-    // of two jobs that come at once with one scene, the second finds it prepared
-    let turn = job.turns.take(&spec.scene.source, || job.fleet.check())?;
-    let Done::Prepared { scene: reference, reused } = job.fleet.call(prepare)? else {
-        return Err(JobError::Internal("a worker reports something else than it was to do".into()));
+    let (reference, reused) = match known(job, replicas)? {
+        Some(known) => (known, true),
+        None => prepared(job, replicas)?,
     };
-    drop(turn);
     keeper.prepared(&reference, reused);
     let store = Arc::new(job.depot.replicated(replicas)?);
     let objects: Arc<dyn ObjectStore> = Arc::new(SceneObjects::new(store, job.runtime.clone())?);
@@ -102,11 +106,38 @@ pub fn run(job: &Job, keeper: &Arc<dyn Keeper>, progress: &dyn Progress) -> Resu
             strategy: spec.strategy,
             memory: spec.workers.memory.map(|m| m.bytes()),
             replicas,
+            near: spec.placement != Placement::None,
             buckets: job.slots.iter().sum(),
         };
         render(job, keeper, progress, &scene, &stage, &places, &sampling, (number, picture))?;
     }
     Ok(())
+}
+
+/// Has the scene prepared by a worker, unless it is; its manifest, and whether it was there.
+fn prepared(job: &Job, replicas: u32) -> Result<(ObjectRef, bool), JobError> {
+    let prepare = Work::Prepare { spec: Box::new(job.spec.clone()), replicas };
+    // of two jobs that come at once with one scene, the second finds it prepared
+    let _turn = job.turns.take(&job.spec.scene.source, || job.fleet.check())?;
+    match job.fleet.call(prepare)? {
+        Done::Prepared { scene, reused } => Ok((scene, reused)),
+        _ => Err(JobError::Internal("a worker reports something else than it was to do".into())),
+    }
+}
+
+/// The manifest that is known by its hash, if it is there still. A job that goes on needs its source no more, which may lie on a store
+/// that is silent.
+fn known(job: &Job, replicas: u32) -> Result<Option<ObjectRef>, JobError> {
+    let Some(hash) = job.known.as_deref().and_then(|h| h.parse().ok()) else { return Ok(None) };
+    let store = job.depot.replicated(replicas)?;
+    match job.runtime.block_on(store.size(&object_key(&hash))) {
+        Ok(size) => Ok(size.map(|bytes| ObjectRef { hash, bytes })),
+        Err(e @ StoreError::Unavailable { .. }) => {
+            tracing::warn!("{e}: the scene is prepared again");
+            Ok(None)
+        }
+        Err(e) => Err(e.into()),
+    }
 }
 
 fn render(
@@ -135,14 +166,16 @@ fn render(
         scene,
         frame: &stage.frame,
         settings: &settings,
-        nodes: Nodes::real(scene, &settings, part, job.depot.len(), None)?,
+        nodes: Nodes::real(scene, &settings, part.clone(), job.depot.len(), None)?,
         store_film: true,
         buckets: stage.buckets,
     };
     let image = scene.image_name(&stage.frame)?;
     let states = resume(&shared.nodes, &image, &journal::scope(scene, &stage.frame), keeper.newest(number))?;
     let pointer = FramePointer { keeper: keeper.clone(), frame: number };
-    job.fleet.open(stage.clone(), places.to_vec());
+    // where nobody looks where data lies, nobody holds any
+    let places = if stage.near { places.to_vec() } else { vec![Vec::new(); places.len()] };
+    job.fleet.open(stage.clone(), places);
     let (resumed, film_lost) = whole(job.fleet, states)?;
     // rays that wait for splits of another cut of the scene are of no use
     let other_cut = resumed.ledger.waiting().find(|g| !is_of_cut(g, &scene.cut)).map(|g| g.key.clone());
@@ -163,14 +196,16 @@ fn render(
     if let Some(why) = lost {
         driver.go_back(&why)?;
     }
-    if let Err(e) = driver.run(job.fleet) {
+    let guard = Guard::new((job.fleet, job.depot, &part), keeper.as_ref(), &job.runtime, job.patience);
+    if let Err(e) = driver.run(&guard) {
         driver.stop_all();
         return Err(e);
     }
     driver.stop_all();
-    let (film, spp, report) = driver.finish()?;
-    let (.., picture) = film.merge(None, spp, Some(picture.to_owned()))?;
-    keeper.done(number, &picture, &report);
+    let (film, spp, mut report) = driver.finish()?;
+    let merged = film.merge(None, spp, Some(picture.to_owned()))?;
+    report.note_non_finite(stage.frame.size[0], &merged.non_finite);
+    keeper.done(number, &merged.picture, &report);
     Ok(())
 }
 

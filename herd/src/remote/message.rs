@@ -74,6 +74,8 @@ pub struct Stage {
     pub memory: Option<u64>,
     /// Copies of each object.
     pub replicas: u32,
+    /// Whether the copy at home is read first, where there is one; else any, as hashing has it.
+    pub near: bool,
     /// Buckets of the reduce step.
     pub buckets: u32,
 }
@@ -104,6 +106,18 @@ pub enum Work {
         spp: u32,
         /// The picture is written under this key of the storage, as OpenEXR.
         picture: Option<String>,
+    },
+    /// Copy rays and film whose copies on one store cannot be had, from those that are left.
+    Copy {
+        /// Names, with the stores that hold each.
+        objects: Vec<(String, Vec<u32>)>,
+        /// The store that is silent.
+        gone: u32,
+    },
+    /// Copy the scene's objects of which there are too few copies without one store.
+    Restore {
+        /// The store that is silent.
+        gone: u32,
     },
 }
 
@@ -147,8 +161,22 @@ pub enum Done {
         film: Option<FilmRef>,
         /// Estimated relMSE.
         rel_mse: Option<f64>,
+        /// Pixel and sample of the first contributions that were not finite.
+        non_finite: Vec<(u32, u32)>,
         /// Where the picture lies, if it was asked for.
         picture: Vec<String>,
+    },
+    /// Of copying.
+    Copied {
+        /// Where the objects lie now; those without a copy that can be had are left out.
+        objects: Vec<(String, Vec<u32>)>,
+    },
+    /// Of restoring.
+    Restored {
+        /// Copies written.
+        copies: u64,
+        /// Objects of which there are too few all the same.
+        few: u64,
     },
 }
 

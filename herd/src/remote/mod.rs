@@ -7,6 +7,7 @@
 pub mod depot;
 pub mod fleet;
 pub mod frames;
+mod guard;
 pub mod message;
 mod parts;
 mod prepare;

@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::PathBuf;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
@@ -26,13 +26,16 @@ use crate::local::usage::thread_cpu;
 use crate::picture;
 use crate::report::{Bytes, Kind, Place};
 use crate::store::{SceneObjects, StoreError, object_key};
-use crate::task::codec;
+use crate::task::{Stop, codec};
 use crate::textures::tile_holders;
 
 /// Between two signs of life.
 const BEAT: Duration = Duration::from_secs(1);
 /// Before an operator that did not answer is asked again.
 const PAUSE: Duration = Duration::from_millis(500);
+/// After work that did not come out for now, before more is asked for: doubled for each such failure in a row, up to the longest.
+const FIRST_REST: Duration = Duration::from_millis(125);
+const LONGEST_REST: Duration = Duration::from_secs(4);
 /// How long a report is offered to an operator that does not answer.
 const PATIENCE: Duration = Duration::from_secs(120);
 
@@ -61,6 +64,9 @@ pub struct Station<'l> {
     runtime: Runtime,
     running: Mutex<BTreeMap<String, StopFlag>>,
     leaving: AtomicBool,
+    panicked: AtomicBool,
+    /// Pieces of work in a row that did not come out for now.
+    failures: AtomicU32,
 }
 
 /// What comes after a stage.
@@ -83,21 +89,42 @@ impl<'l> Station<'l> {
     ) -> Result<Self, JobError> {
         let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(1).enable_all().build();
         let runtime = runtime.map_err(|e| JobError::Internal(format!("no runtime for input and output: {e}")))?;
-        let (running, leaving) = (Mutex::default(), AtomicBool::new(false));
-        Ok(Station { link, depot, slots: slots.max(1), worker, scratch, runtime, running, leaving })
+        let (running, leaving, panicked) = (Mutex::default(), AtomicBool::new(false), AtomicBool::new(false));
+        let failures = AtomicU32::new(0);
+        let slots = slots.max(1);
+        Ok(Station { link, depot, slots, worker, scratch, runtime, running, leaving, panicked, failures })
     }
 
     /// Works until the job is over, or [`Station::leave`] was called.
     ///
     /// # Errors
-    /// When a stage cannot be opened and never will be.
+    /// When a stage cannot be opened and never will be, or one of its threads panicked.
     pub fn run(&self) -> Result<(), JobError> {
         std::thread::scope(|scope| {
-            scope.spawn(|| self.beat());
-            let result = self.stages();
+            scope.spawn(|| self.guarded("beating", || self.beat()));
+            let result = self.guarded("going through stages", || self.stages()).unwrap_or(Ok(()));
             self.leaving.store(true, Ordering::Relaxed);
+            if self.has_panicked() {
+                return Err(JobError::Internal("a thread of the worker panicked".into()));
+            }
             result
         })
+    }
+
+    /// A worker of which a part is dead must not look alive: after a panic all of it leaves.
+    fn guarded<T>(&self, what: &str, run: impl FnOnce() -> T) -> Option<T> {
+        let done = catch_unwind(AssertUnwindSafe(run)).ok();
+        if done.is_none() {
+            tracing::error!("panicked while {what}: the worker leaves");
+            self.panicked.store(true, Ordering::Relaxed);
+            self.leave();
+        }
+        done
+    }
+
+    /// Whether one of its threads panicked.
+    pub fn has_panicked(&self) -> bool {
+        self.panicked.load(Ordering::Relaxed)
     }
 
     /// Stops what runs, which is given back, and ends.
@@ -169,7 +196,8 @@ impl<'l> Station<'l> {
         };
         let part = Arc::new(self.depot.part(&stage.prefix, stage.replicas)?);
         let placement = placement(&scene, disks, stage.replicas);
-        let near = Near { station: self, placement, replicas: stage.replicas };
+        let near =
+            Near { station: self, placement, replicas: stage.replicas, home: self.depot.home().filter(|_| stage.near) };
         let nodes = Nodes::real(&scene, &settings, part, disks, Some(Box::new(near)))?;
         let shared = Shared {
             scene: &scene,
@@ -192,14 +220,13 @@ impl<'l> Station<'l> {
     /// Runs all slots, and a clerk, until one is told of another stage, as then all are.
     fn slots(&self, stage: Option<&Stage>, shared: Option<&Shared>) -> Next {
         std::thread::scope(|scope| {
-            let threads: Vec<_> =
-                (0..=self.slots).map(|n| scope.spawn(move || self.slot(stage, shared, n == self.slots))).collect();
+            let slot = |n| move || self.guarded("asking for work", || self.slot(stage, shared, n == self.slots));
+            let threads: Vec<_> = (0..=self.slots).map(|n| scope.spawn(slot(n))).collect();
             let mut next = Next::Over;
             for thread in threads {
-                match thread.join() {
-                    Ok(Next::Over) => {}
-                    Ok(open) => next = open,
-                    Err(_) => tracing::error!("a slot panicked"),
+                // a panic was told and ends all
+                if let Ok(Some(open @ Next::Open(_))) = thread.join() {
+                    next = open;
                 }
             }
             next
@@ -241,6 +268,7 @@ impl<'l> Station<'l> {
             }
             failure
         });
+        let rest = self.rest(&result);
         let bytes = shared.map_or_else(Bytes::default, |s| s.nodes.take_bytes()).rows();
         let report = Report { worker: self.worker.clone(), id: id.clone(), result, cpu, bytes };
         let since = Instant::now();
@@ -253,6 +281,24 @@ impl<'l> Station<'l> {
             std::thread::sleep(PAUSE);
         }
         self.lock().remove(&id);
+        // others may take it meanwhile
+        let end = Instant::now() + rest;
+        while Instant::now() < end && !self.is_leaving() {
+            std::thread::sleep(end.saturating_duration_since(Instant::now()).min(PAUSE));
+        }
+    }
+
+    /// How long to wait before more work is asked for: what fails for now would fail again at once.
+    fn rest(&self, result: &Result<Done, Failure>) -> Duration {
+        match result {
+            Ok(_) => self.failures.store(0, Ordering::Relaxed),
+            Err(Failure::ForNow { .. }) => {
+                let before = self.failures.fetch_add(1, Ordering::Relaxed);
+                return FIRST_REST.saturating_mul(1 << before.min(8)).min(LONGEST_REST);
+            }
+            Err(_) => {}
+        }
+        Duration::ZERO
     }
 
     fn done(
@@ -279,7 +325,40 @@ impl<'l> Station<'l> {
                 let (_, shared) = open()?;
                 self.merge(shared, name.as_deref(), parts, *spp, picture.as_deref())
             }
+            Work::Copy { objects, gone } => {
+                let (_, shared) = open()?;
+                let mut copied = Vec::new();
+                for (name, holders) in objects {
+                    stop.check()?;
+                    let now = shared.nodes.copy_elsewhere(name, holders, *gone)?;
+                    copied.extend(now.map(|holders| (name.clone(), holders)));
+                }
+                Ok(Done::Copied { objects: copied })
+            }
+            Work::Restore { gone } => {
+                let (stage, shared) = open()?;
+                self.restore(stage, shared.scene, *gone, stop)
+            }
         }
+    }
+
+    /// Copies of the scene's objects that lay on a store which is silent, made again where there is one.
+    fn restore(&self, stage: &Stage, scene: &PreparedScene, gone: u32, stop: &StopFlag) -> Result<Done, JobError> {
+        let (count, replicas, m) = (self.depot.len(), stage.replicas, &scene.manifest);
+        let splits = m.splits.iter().zip(placement(scene, count, replicas)).filter(|(_, on)| on.contains(&gone));
+        let tiles = (0..).zip(&m.tiles).filter(|(n, _)| tile_holders(*n, count, replicas).contains(&gone));
+        // what belongs to no place may be anywhere
+        let others = [&m.world, &stage.scene].into_iter().chain(&m.sky_map);
+        let objects = splits.flat_map(|(s, _)| [&s.geometry, &s.attributes]).chain(tiles.map(|t| t.1)).chain(others);
+        let store = self.depot.replicated(replicas)?;
+        let (mut copies, mut few) = (0, 0);
+        for object in objects {
+            stop.check()?;
+            let (copied, enough) = self.runtime.block_on(store.replicated().keep_up(&object_key(&object.hash)));
+            copies += copied;
+            few += u64::from(!enough);
+        }
+        Ok(Done::Restored { copies, few })
     }
 
     /// Our place among the stores; one past them when none is here.
@@ -311,7 +390,8 @@ impl<'l> Station<'l> {
             _ => None,
         };
         let picture = picture.map(|key| self.write_picture(shared.scene, shared.frame, &sum, spp, key)).transpose()?;
-        Ok(Done::Merged { film, rel_mse: sum.rel_mse(spp), picture: picture.unwrap_or_default() })
+        let non_finite = sum.rejected().keys.iter().copied().collect();
+        Ok(Done::Merged { film, rel_mse: sum.rel_mse(spp), non_finite, picture: picture.unwrap_or_default() })
     }
 
     /// Writes the picture on the first stores that take it; where it lies.
@@ -349,18 +429,25 @@ struct Near<'s, 'l> {
     station: &'s Station<'l>,
     placement: Vec<Vec<u32>>,
     replicas: u32,
+    /// The store that is asked first, wherever the object belongs.
+    home: Option<u32>,
 }
 
 impl Fetch for Near<'_, '_> {
     fn fetch(&self, part: Part, object: &ObjectRef) -> Result<(Vec<u8>, Place), JobError> {
         let depot = &self.station.depot;
-        let home = depot.home();
-        let holders = match part {
+        let (home, first) = (depot.home(), self.home);
+        let mut holders = match part {
             Part::Split(n) => self.placement[n as usize].clone(),
             Part::Tile(n) => tile_holders(n, depot.len(), self.replicas),
         };
-        let holders = holders.into_iter().filter(|&h| Some(h) != home);
-        let mut order: Vec<u32> = home.into_iter().chain(holders).collect();
+        if first.is_none() && !holders.is_empty() {
+            // nobody is near: the copies share what is read
+            let turn = usize::from(blake3::hash(object.hash.to_string().as_bytes()).as_bytes()[0]) % holders.len();
+            holders.rotate_left(turn);
+        }
+        let holders = holders.into_iter().filter(|&h| Some(h) != first);
+        let mut order: Vec<u32> = first.into_iter().chain(holders).collect();
         order.extend((0..depot.len()).filter(|n| !order.contains(n)).collect::<Vec<u32>>());
         let key = object_key(&object.hash);
         let mut error = None;

@@ -7,7 +7,10 @@ use serde::{Deserialize, Serialize};
 
 use super::Depot;
 use crate::job::JobError;
-use crate::store::{BlockStore, RetryPolicy, Retrying, S3Credentials, S3Settings, S3Store};
+use crate::store::{Patience, RetryPolicy, Retrying, S3Credentials, S3Settings, S3Store, TcpPulse, Watched};
+
+/// To take a server's pulse: one packet may be lost, which a kernel sends again after 1 s.
+const PULSE: Duration = Duration::from_secs(2);
 
 /// A server of the storage.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -17,6 +20,18 @@ pub struct Endpoint {
     pub url: String,
     /// The node that it runs on; none outside the cluster.
     pub node: Option<String>,
+}
+
+impl Endpoint {
+    /// `host:port`, the port of the scheme where none is given.
+    fn address(&self) -> String {
+        let (scheme, rest) = self.url.split_once("://").unwrap_or(("http", &self.url));
+        let host = rest.split('/').next().unwrap_or_default();
+        let has_port =
+            host.rsplit_once(':').is_some_and(|(_, p)| !p.is_empty() && p.bytes().all(|b| b.is_ascii_digit()));
+        let port = if scheme == "https" { 443 } else { 80 };
+        if has_port { host.to_owned() } else { format!("{host}:{port}") }
+    }
 }
 
 /// All servers, in the order that everybody numbers them by, and where the data is in each.
@@ -56,10 +71,30 @@ impl Storage {
                 path_style: true,
                 credentials: credentials.clone(),
             };
-            Ok(Arc::new(Retrying::new(Arc::new(S3Store::new(settings)?), policy)) as Arc<dyn BlockStore>)
+            let store = Retrying::new(Arc::new(S3Store::new(settings)?), policy);
+            let pulse = TcpPulse { address: e.address(), longest: PULSE };
+            Ok(Arc::new(Watched::new(Arc::new(store), Arc::new(pulse), Patience::default())))
         };
         let stores = self.endpoints.iter().map(open).collect::<Result<_, JobError>>()?;
         let home = self.endpoints.iter().position(|e| e.node.is_some() && e.node.as_deref() == node);
-        Depot::new(stores, home.map(|h| h as u32))
+        Depot::watched(stores, home.map(|h| h as u32))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_endpoint_has_an_address_to_connect_to() {
+        for (url, address) in [
+            ("http://minio-0.minio.store.svc:9000", "minio-0.minio.store.svc:9000"),
+            ("http://minio", "minio:80"),
+            ("https://s3.example.com/", "s3.example.com:443"),
+            ("http://[fd00::1]:9000/", "[fd00::1]:9000"),
+            ("http://[fd00::a]", "[fd00::a]:80"),
+        ] {
+            assert_eq!(Endpoint { url: url.into(), node: None }.address(), address);
+        }
     }
 }

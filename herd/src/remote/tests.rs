@@ -19,7 +19,7 @@ use crate::job::{JobError, JobSettings, PreparedScene, Sampling, Silent, spec as
 use crate::local::{journal, render_local};
 use crate::picture;
 use crate::report;
-use crate::store::{BlockStore, FaultPlan, Faulty, MemoryStore};
+use crate::store::{BlockStore, FaultPlan, Faulty, MemoryStore, Patience, Watched};
 
 const EXAMPLE: &str = include_str!("../../../examples/cornell-box.xml");
 const SOURCE: &str = "scenes/cornell/box.xml";
@@ -81,6 +81,7 @@ struct Kept {
     prepared: Mutex<Vec<(ObjectRef, bool)>>,
     reports: Mutex<Vec<report::Report>>,
     pictures: Mutex<Vec<Vec<String>>>,
+    below: Mutex<Vec<Option<String>>>,
 }
 
 impl Keeper for Kept {
@@ -100,6 +101,9 @@ impl Keeper for Kept {
     }
     fn placed(&self, bytes: &[u64]) {
         assert!(bytes.iter().sum::<u64>() > 0);
+    }
+    fn below(&self, what: Option<&str>) {
+        self.below.lock().unwrap().push(what.map(str::to_owned));
     }
     fn done(&self, _: u32, picture: &[String], report: &report::Report) {
         self.pictures.lock().unwrap().push(picture.to_vec());
@@ -154,12 +158,16 @@ impl Cluster {
         cluster
     }
     fn depot(&self, home: Option<u32>) -> Depot {
-        Depot::new(self.stores.iter().map(|s| s.clone() as Arc<dyn BlockStore>).collect(), home).unwrap()
+        let patience = Patience { answer: Duration::from_millis(200), pause: Duration::from_millis(300) };
+        let watched = |s: &Arc<Faulty>| Arc::new(Watched::new(s.clone(), s.clone(), patience));
+        Depot::watched(self.stores.iter().map(watched).collect(), home).unwrap()
     }
     fn job<'a>(&'a self, spec: &'a RenderJobSpec, depot: &'a Depot, fleet: &'a Fleet, session: &str) -> Job<'a> {
         Job {
             spec,
             pictures: vec!["out/a.exr".into()],
+            known: None,
+            patience: Duration::from_millis(300),
             prefix: "jobs/1".into(),
             session: session.into(),
             depot,
@@ -380,7 +388,7 @@ fn a_worker_that_comes_back_under_another_session_loses_only_its_tasks() {
         let report = |session: &str, id: &str, rel_mse| Report {
             worker: WorkerId { number: 0, session: session.into() },
             id: id.into(),
-            result: Ok(super::message::Done::Merged { film: None, rel_mse, picture: vec![] }),
+            result: Ok(super::message::Done::Merged { film: None, rel_mse, non_finite: vec![], picture: vec![] }),
             cpu: 0.0,
             bytes: vec![],
         };
@@ -424,4 +432,92 @@ fn a_store_that_goes_while_rays_wait_costs_copies_and_no_byte() {
     });
     assert!(cluster.picture(2) == expected(&spec));
     assert_eq!(kept.reports.lock().unwrap()[0].tasks_redone, 0);
+}
+
+#[test]
+fn a_machine_whose_plug_is_pulled_costs_its_copies_and_no_byte() {
+    let mut spec = spec(Strategy::SchedulingGridOverlapReduced, 4, 2);
+    spec.task_seconds = Some(0.003);
+    let (cluster, kept) = (Cluster::new(3), Arc::new(Kept::default()));
+    let (fleet, depot) = (Fleet::new(3, "e"), cluster.depot(None));
+    let wire = cluster.wire(&fleet);
+    std::thread::scope(|scope| {
+        for number in 0..3 {
+            let station = cluster.station(&wire, number, "s", Some(number));
+            scope.spawn(move || station.run().unwrap());
+        }
+        let keeper: Arc<dyn Keeper> = kept.clone();
+        let (spec, depot, fleet, cluster) = (&spec, &depot, &fleet, &cluster);
+        let job = scope.spawn(move || {
+            let job = Job { patience: Duration::ZERO, ..cluster.job(spec, depot, fleet, "e") };
+            let result = run(&job, &keeper, &Silent);
+            fleet.end();
+            result
+        });
+        wait_for(|| kept.newest(0).is_some_and(|p| p.0 >= 3));
+        cluster.stores[1].hang(true);
+        if let Err(e) = job.join().unwrap() {
+            panic!("{e}");
+        }
+    });
+    assert!(cluster.picture(2) == expected(&spec));
+    assert_eq!(kept.reports.lock().unwrap()[0].tasks_redone, 0);
+    // who asked it when the plug was pulled, and nobody later
+    assert!(cluster.stores[1].hung() < 40, "{} requests were left hanging", cluster.stores[1].hung());
+    let below = kept.below.lock().unwrap();
+    assert!(below[0].as_ref().is_some_and(|m| m.contains("store 1 is silent")), "{below:?}");
+    assert_eq!(below.last(), Some(&None), "all was copied: {below:?}");
+    // of two copies of everything in the scene both are on the stores that are left
+    let objects = |store: usize| -> Vec<String> {
+        let listed = cluster.runtime.block_on(cluster.stores[store].list("objects/")).unwrap();
+        listed.into_iter().map(|(key, _)| key).collect()
+    };
+    assert!(objects(0).len() > 8, "{:?}", objects(0));
+    assert_eq!(objects(0), objects(2));
+}
+
+#[test]
+fn a_job_whose_scene_is_known_needs_its_source_no_more() {
+    let spec = spec(Strategy::Auto, 4, 2);
+    let (cluster, kept) = (Cluster::new(3), Arc::new(Kept::default()));
+    cluster.render(&spec, &kept).unwrap();
+    let scene = kept.prepared.lock().unwrap()[0].0.hash.to_string();
+    cluster.runtime.block_on(cluster.stores[0].delete(&[SOURCE.to_owned(), TEXTURE.to_owned()])).unwrap();
+    let again = |known: Option<String>| {
+        let (fleet, depot) = (Fleet::new(3, "f"), cluster.depot(None));
+        let wire = cluster.wire(&fleet);
+        std::thread::scope(|scope| {
+            for number in 0..3 {
+                let station = cluster.station(&wire, number, "s", Some(number));
+                scope.spawn(move || station.run().unwrap());
+            }
+            let keeper: Arc<dyn Keeper> = Arc::new(Kept::default());
+            let job = Job { known, prefix: "jobs/2".into(), ..cluster.job(&spec, &depot, &fleet, "f") };
+            let result = run(&job, &keeper, &Silent);
+            fleet.end();
+            result
+        })
+    };
+    assert!(again(None).unwrap_err().to_string().contains("upload the scene first"));
+    cluster.runtime.block_on(cluster.stores[0].delete(&["out/a.exr".to_owned()])).unwrap();
+    again(Some(scene)).unwrap();
+    assert!(cluster.picture(0) == expected(&spec));
+}
+
+#[test]
+fn workers_that_wait_are_sent_to_the_next_fleet_at_once() {
+    let runtime = Runtime::new().unwrap();
+    let fleet = Fleet::new(1, "e");
+    let worker = WorkerId { number: 0, session: "a".into() };
+    let poll = Poll { worker, home: None, stage: None, clerk: false };
+    // far longer than a test may take
+    let waits = runtime.block_on(async {
+        let waiting = fleet.poll(&poll, Duration::from_secs(3600));
+        let retire = async {
+            tokio::time::sleep(Duration::from_millis(20)).await;
+            fleet.retire();
+        };
+        futures::future::join(waiting, retire).await.0
+    });
+    assert_eq!(waits, Ok(Answer::Wait));
 }

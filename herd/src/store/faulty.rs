@@ -1,14 +1,14 @@
 //! A store that fails on purpose, as a seed says: for tests and fault schedules.
 
 use std::collections::HashMap;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError, RwLock};
 use std::time::Duration;
 
 use async_trait::async_trait;
 use bytes::Bytes;
 
-use super::{BlockStore, StoreError};
+use super::{BlockStore, Pulse, StoreError};
 
 /// What goes wrong and how often: shares of 1000 operations.
 ///
@@ -65,6 +65,8 @@ pub struct Faulty {
     inner: RwLock<Arc<dyn BlockStore>>,
     plan: FaultPlan,
     lost: AtomicBool,
+    hangs: AtomicBool,
+    hung: AtomicU64,
     state: Mutex<State>,
 }
 
@@ -86,7 +88,14 @@ enum Fault {
 impl Faulty {
     /// Around a store.
     pub fn new(inner: Arc<dyn BlockStore>, plan: FaultPlan) -> Self {
-        Self { inner: RwLock::new(inner), plan, lost: AtomicBool::new(false), state: Mutex::default() }
+        Self {
+            inner: RwLock::new(inner),
+            plan,
+            lost: AtomicBool::new(false),
+            hangs: AtomicBool::new(false),
+            hung: AtomicU64::new(0),
+            state: Mutex::default(),
+        }
     }
 
     /// From now on nothing answers, as when the node is gone.
@@ -100,6 +109,16 @@ impl Faulty {
             *self.inner.write().unwrap_or_else(PoisonError::into_inner) = disk;
         }
         self.lost.store(false, Ordering::SeqCst);
+    }
+
+    /// From now on operations do not end, as when the plug of its machine is pulled; or they do again.
+    pub fn hang(&self, hangs: bool) {
+        self.hangs.store(hangs, Ordering::SeqCst);
+    }
+
+    /// Operations that found their machine without power.
+    pub fn hung(&self) -> u64 {
+        self.hung.load(Ordering::SeqCst)
     }
 
     /// Whether the node is lost now.
@@ -137,6 +156,12 @@ impl Faulty {
 
     /// Decides on an operation, and waits if that was drawn.
     async fn begin(&self, action: &'static str, key: &str) -> Result<Fault, StoreError> {
+        if self.hangs.load(Ordering::SeqCst) {
+            self.hung.fetch_add(1, Ordering::SeqCst);
+            while self.hangs.load(Ordering::SeqCst) {
+                tokio::time::sleep(Duration::from_millis(5)).await;
+            }
+        }
         let (fault, delay) = self.decide(action, key);
         if !delay.is_zero() {
             tokio::time::sleep(delay).await;
@@ -211,6 +236,13 @@ fn corrupted(body: &Bytes, draw: u64) -> Bytes {
         n => bytes[place % n] ^= 1 << (draw % 8),
     }
     bytes.into()
+}
+
+#[async_trait]
+impl Pulse for Faulty {
+    async fn take(&self) -> Result<(), String> {
+        if self.is_lost() || self.hangs.load(Ordering::SeqCst) { Err("no pulse".to_owned()) } else { Ok(()) }
+    }
 }
 
 #[async_trait]

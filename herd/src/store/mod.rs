@@ -16,6 +16,7 @@ mod s3;
 pub mod s3_server;
 mod spilling;
 mod temporary;
+mod watched;
 
 use async_trait::async_trait;
 use bytes::Bytes;
@@ -32,6 +33,7 @@ pub use retrying::{RetryPolicy, Retrying};
 pub use s3::{S3Credentials, S3Settings, S3Store};
 pub use spilling::Spilling;
 pub use temporary::TemporaryFolder;
+pub use watched::{Patience, Pulse, TcpPulse, Watched};
 
 /// A flat space of named, immutable objects.
 ///

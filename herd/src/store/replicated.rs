@@ -123,6 +123,22 @@ impl Replicated {
         Ok(self.counts.rewritten.load(Ordering::Relaxed) - before)
     }
 
+    /// Makes sure that a key has R copies on nodes that answer, reading it only if it has fewer: copies written, and whether there are
+    /// enough now.
+    pub async fn keep_up(&self, key: &str) -> (u64, bool) {
+        self.lock().remove(key);
+        match self.locate(key).await {
+            Ok((holders, _)) if holders.len() >= self.copies => return (0, true),
+            Ok((holders, _)) if holders.is_empty() => return (0, false),
+            _ => {}
+        }
+        let written = self.restore(key).await.unwrap_or_else(|error| {
+            tracing::warn!(%key, %error, "it cannot be copied");
+            0
+        });
+        (written, self.lock().get(key).is_some_and(|h| h.len() >= self.copies))
+    }
+
     fn lock(&self) -> MutexGuard<'_, HashMap<String, Vec<usize>>> {
         self.holders.lock().unwrap_or_else(PoisonError::into_inner)
     }

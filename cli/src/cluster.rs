@@ -1,0 +1,228 @@
+//! Jobs on a Kubernetes cluster, by the conventions of kubectl. Only this module knows Kubernetes.
+
+use anyhow::Context;
+use clap::Args;
+use k8s_openapi::api::core::v1::Pod;
+use k8s_openapi::jiff::Timestamp;
+use kube::api::{ListParams, LogParams, Patch, PatchParams};
+use kube::config::{KubeConfigOptions, Kubeconfig};
+use kube::{Api, Client, Config, ResourceExt};
+use rayherd_api::RenderJob;
+use rayherd_api::resource::RenderJobObject;
+use rustls::crypto::ring::default_provider;
+use tokio::runtime::Runtime;
+
+use crate::fault::Mistake;
+
+/// Field manager of what is submitted.
+const MANAGER: &str = "rayherd";
+/// The label of a job's pods; its value is the job's uid.
+const LABEL: &str = "rayherd.io/job";
+/// The number of a worker.
+const NUMBER: &str = "rayherd.io/worker";
+
+/// Which cluster, and where in it.
+#[derive(Args)]
+#[command(next_help_heading = "Cluster")]
+pub struct ClusterOptions {
+    /// Namespace [default: the context's, or default]
+    #[arg(short, long, value_name = "NAME")]
+    namespace: Option<String>,
+    /// Context of the kubeconfig (KUBECONFIG, or ~/.kube/config) [default: the current one]
+    #[arg(long, value_name = "NAME")]
+    context: Option<String>,
+}
+
+/// A cluster.
+pub struct Cluster {
+    client: Client,
+    namespace: String,
+    runtime: Runtime,
+}
+
+/// A job, as it is shown.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Shown {
+    /// Where it is.
+    pub namespace: String,
+    /// Its name.
+    pub name: String,
+    /// `Rendering`, `Complete`, ...: of the spec as it stands now.
+    pub phase: String,
+    /// Samples made of those asked for.
+    pub progress: String,
+    /// Estimated relMSE.
+    pub error: String,
+    /// Share of scene bytes read from other nodes.
+    pub remote: String,
+    /// Workers there, of those wanted.
+    pub workers: String,
+    /// How old it is.
+    pub age: String,
+    /// What is wrong with it, if it failed.
+    pub why: Option<String>,
+}
+
+impl Cluster {
+    /// Connects, as kubectl would.
+    ///
+    /// # Errors
+    /// When there is no kubeconfig, or it names no such context.
+    pub fn connect(options: &ClusterOptions) -> anyhow::Result<Self> {
+        // one provider for every TLS connection of the process; set already by an earlier call
+        let _ = default_provider().install_default();
+        let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(1).enable_all().build();
+        let runtime = runtime.context("cannot start a thread for input and output")?;
+        let hint = "set KUBECONFIG, or have a ~/.kube/config that names the cluster";
+        let config = match &options.context {
+            Some(context) => runtime.block_on(async {
+                let all = Kubeconfig::read().map_err(|e| Mistake(format!("{e}: {hint}")))?;
+                let options = KubeConfigOptions { context: Some(context.clone()), ..KubeConfigOptions::default() };
+                let found = Config::from_custom_kubeconfig(all, &options).await;
+                found.map_err(|e| anyhow::Error::from(Mistake(format!("context {context}: {e}"))))
+            })?,
+            None => runtime.block_on(Config::infer()).map_err(|e| Mistake(format!("{e}: {hint}")))?,
+        };
+        let namespace = options.namespace.clone().unwrap_or_else(|| config.default_namespace.clone());
+        let client = runtime.block_on(async { Client::try_from(config) })?;
+        Ok(Cluster { client, namespace, runtime })
+    }
+
+    fn api(&self) -> Api<RenderJobObject> {
+        Api::namespaced(self.client.clone(), &self.namespace)
+    }
+
+    /// The namespace that is worked in.
+    pub fn namespace(&self) -> &str {
+        &self.namespace
+    }
+
+    /// Makes a job, or changes the one of its name.
+    ///
+    /// # Errors
+    /// When the API server does not take it: its message says why.
+    pub fn apply(&self, job: &RenderJob) -> anyhow::Result<()> {
+        let name = job.metadata.name.as_deref().unwrap_or_default();
+        let params = PatchParams::apply(MANAGER).force();
+        let done = self.runtime.block_on(self.api().patch(name, &params, &Patch::Apply(job)));
+        done.map(drop).map_err(|e| self.told(e, &format!("renderjob {name} is not taken")))
+    }
+
+    /// A job.
+    ///
+    /// # Errors
+    /// When there is none of this name.
+    pub fn job(&self, name: &str) -> anyhow::Result<Shown> {
+        let job = self.runtime.block_on(self.api().get(name));
+        job.map(|j| shown(&j)).map_err(|e| self.told(e, &format!("renderjob {name}")))
+    }
+
+    /// All jobs, of the namespace or of all.
+    ///
+    /// # Errors
+    /// When the API server does not list them.
+    pub fn jobs(&self, everywhere: bool) -> anyhow::Result<Vec<Shown>> {
+        let api: Api<RenderJobObject> = if everywhere { Api::all(self.client.clone()) } else { self.api() };
+        let listed = self.runtime.block_on(api.list(&ListParams::default()));
+        let mut jobs: Vec<Shown> = listed.map_err(|e| self.told(e, "renderjobs"))?.iter().map(shown).collect();
+        jobs.sort_by(|a, b| (&a.namespace, &a.name).cmp(&(&b.namespace, &b.name)));
+        Ok(jobs)
+    }
+
+    /// The logs of a job's workers: name of the pod and text, by worker.
+    ///
+    /// # Errors
+    /// When there is no such job, or its pods' logs are refused.
+    pub fn logs(&self, name: &str, tail: Option<i64>) -> anyhow::Result<Vec<(String, String)>> {
+        let read = async {
+            let job = self.api().get(name).await?;
+            let pods: Api<Pod> = Api::namespaced(self.client.clone(), &self.namespace);
+            let label = format!("{LABEL}={}", job.metadata.uid.unwrap_or_default());
+            let mut found = pods.list(&ListParams::default().labels(&label)).await?.items;
+            found.sort_by_key(|p| (p.labels().get(NUMBER).and_then(|n| n.parse::<u32>().ok()), p.name_any()));
+            let mut logs = Vec::new();
+            let params = LogParams { tail_lines: tail, container: Some("worker".into()), ..LogParams::default() };
+            for pod in found {
+                let text = match pods.logs(&pod.name_any(), &params).await {
+                    Ok(text) => text,
+                    // a container that has not begun has no log yet
+                    Err(kube::Error::Api(e)) if e.code == 400 => format!("({})\n", e.message),
+                    Err(kube::Error::Api(e)) if e.code == 404 => continue,
+                    Err(e) => return Err(e),
+                };
+                logs.push((pod.name_any(), text));
+            }
+            Ok(logs)
+        };
+        self.runtime.block_on(read).map_err(|e: kube::Error| self.told(e, &format!("logs of renderjob {name}")))
+    }
+
+    /// What the user can put right is told as that.
+    fn told(&self, error: kube::Error, what: &str) -> anyhow::Error {
+        match error {
+            kube::Error::Api(e) if e.code == 404 && e.message.contains("could not find the requested resource") => Mistake(
+                "the cluster knows no RenderJob: kubectl apply --server-side -f crds/renderjob.yaml, and install the chart".into(),
+            )
+            .into(),
+            kube::Error::Api(e) if (400..500).contains(&e.code) => {
+                Mistake(format!("{what}: {} (namespace {})", e.message, self.namespace)).into()
+            }
+            e => anyhow::Error::new(e).context(format!("{what}: the API server does not do it")),
+        }
+    }
+}
+
+fn shown(job: &RenderJobObject) -> Shown {
+    let status = job.status.clone().unwrap_or_default();
+    let current = status.observed_generation == job.metadata.generation;
+    let failed = status.conditions.iter().find(|c| c.type_ == "Failed" && c.status == "True" && current);
+    let age = job.metadata.creation_timestamp.as_ref();
+    Shown {
+        namespace: job.namespace().unwrap_or_default(),
+        name: job.name_any(),
+        phase: status.phase.filter(|_| current).unwrap_or_else(|| "Pending".into()),
+        progress: status.progress.unwrap_or_default(),
+        error: status.rel_mse.unwrap_or_default(),
+        remote: status.remote_read_ratio.unwrap_or_default(),
+        workers: status.workers.unwrap_or_default(),
+        age: age.map(|t| short(Timestamp::now().duration_since(t.0).as_secs())).unwrap_or_default(),
+        why: failed.map(|c| c.message.clone()),
+    }
+}
+
+/// A time as kubectl shows it: in its largest whole unit.
+fn short(seconds: i64) -> String {
+    match seconds.max(0) {
+        s @ ..=119 => format!("{s}s"),
+        s @ ..=7199 => format!("{}m", s / 60),
+        s @ ..=172_799 => format!("{}h", s / 3600),
+        s => format!("{}d", s / 86_400),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_job_is_shown_as_its_spec_stands_now() {
+        let job = |observed: i64| -> RenderJobObject {
+            serde_json::from_value(serde_json::json!({
+                "apiVersion": "rayherd.io/v1alpha1",
+                "kind": "RenderJob",
+                "metadata": {"name": "box", "namespace": "studio", "generation": 2},
+                "spec": {"scene": {"source": "a/b.xml"}},
+                "status": {"phase": "Failed", "observedGeneration": observed, "progress": "40%", "conditions": [{
+                    "type": "Failed", "status": "True", "reason": "CannotRender", "message": "no",
+                    "lastTransitionTime": "2026-01-01T00:00:00Z",
+                }]},
+            }))
+            .unwrap()
+        };
+        let now = shown(&job(2));
+        assert_eq!((now.phase.as_str(), now.why.as_deref(), now.progress.as_str()), ("Failed", Some("no"), "40%"));
+        let changed = shown(&job(1));
+        assert_eq!((changed.phase.as_str(), changed.why), ("Pending", None));
+        assert_eq!([5, 119, 120, 7199, 7200, 200_000].map(short), ["5s", "119s", "2m", "119m", "2h", "2d"]);
+    }
+}
