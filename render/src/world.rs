@@ -22,6 +22,9 @@ pub struct World {
     pub beams: Vec<Beam>,
     /// The sky, if any.
     pub environment: Option<Environment>,
+    /// The sun, if any.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub sun: Option<Sun>,
     /// Lower corner of the scene's box.
     pub lo: [f32; 3],
     /// Upper corner of the scene's box.
@@ -76,7 +79,27 @@ pub enum Environment {
         scale: f32,
         /// Rows of the rotation (perhaps mirrored) that turns a direction of the world into one of the picture.
         to_map: [[f32; 3]; 3],
+        /// Nothing comes from the picture's lower half (y below 0), not even by interpolation.
+        #[serde(default, skip_serializing_if = "is_false")]
+        upper: bool,
     },
+}
+
+fn is_false(b: &bool) -> bool {
+    !b
+}
+
+/// A disk that shines evenly from infinitely far away.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Sun {
+    /// Unit vector towards its middle.
+    pub direction: [f32; 3],
+    /// Unit vector upwards: nothing comes from below the horizon.
+    pub up: [f32; 3],
+    /// 1 - cos of the angle from its middle to its edge, in (0, 1).
+    pub cap: f32,
+    /// W/sr/m2.
+    pub radiance: [f32; 3],
 }
 
 /// Light that arrives at a point from one direction only.

@@ -231,6 +231,36 @@ pub enum Environment {
         /// Turns directions of the picture to the world's: rotation, mirroring and even scaling only; the latter changes nothing.
         to_world: Affine,
     },
+    /// A clear sky.
+    Sky(Skylight),
+}
+
+/// A clear sky over the horizon of a flat world, dark below: the model of Hosek and Wilkie. In its own directions z is up.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Skylight {
+    /// Haze, from 1 (none) to 10.
+    pub turbidity: f64,
+    /// Albedo of the ground, linear RGB in [0, 1].
+    pub albedo: [f64; 3],
+    /// Unit vector towards the sun, in the sky's directions; z is not negative.
+    pub sun: [f64; 3],
+    /// What radiances are multiplied by, above 0.
+    pub scale: f32,
+    /// Turns the sky's directions to the world's: rotation, mirroring and even scaling only; the latter changes nothing.
+    pub to_world: Affine,
+}
+
+/// A disk that shines from infinitely far away. World space.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Sun {
+    /// Unit vector towards its middle.
+    pub direction: [f64; 3],
+    /// Unit vector upwards: what of the disk lies below the horizon is not seen.
+    pub up: [f64; 3],
+    /// Half of the angle that it fills, radians, in (0, pi / 2).
+    pub half_angle: f64,
+    /// W/sr/m2, linear RGB.
+    pub radiance: [f32; 3],
 }
 
 /// Everything that a source says.
@@ -246,6 +276,8 @@ pub struct Description {
     pub beams: Vec<Beam>,
     /// The sky, if any.
     pub environment: Option<Environment>,
+    /// The sun, if any.
+    pub sun: Option<Sun>,
     /// The camera, if the source has one.
     pub camera: Option<Camera>,
     /// Width and height in pixels, if given.

@@ -43,7 +43,8 @@ def main() -> int:
     names = [n for name in a.names for n in groups.get(name, [name])]
     for name in names:
         xml = scenes.prepare(name, a.shared.resolve(), a.work.resolve())
-        scene = mi.load_file(str(xml), **scenes.parameters(xml, a.size, a.max_depth))
+        other = scenes.theirs(xml) if scenes.theirs(xml).exists() else xml
+        scene = mi.load_file(str(other), **scenes.parameters(xml, a.size, a.max_depth))
         spp, renders = (64, 8) if a.quick else scenes.ENOUGH.get(name, (256, 16))
         spp, renders = a.spp or spp, a.renders or renders
         theirs, ours = [], []

@@ -5,9 +5,9 @@ import sys
 import tarfile
 from pathlib import Path
 
-NAMES = ["cornell", "veach-mis", "gyroid", "staircase", "living-room"]
-# of ../shared/data; classroom wants a sun, dining-room lacks its sky
-ROOMS = ["staircase", "living-room"]
+NAMES = ["cornell", "veach-mis", "gyroid", "staircase", "living-room", "classroom", "dining-room"]
+# of ../shared/data, and which of their files: dining-room's other one lacks its sky
+ROOMS = {"staircase": "scene.xml", "living-room": "scene.xml", "classroom": "scene.xml", "dining-room": "scene_sunsky.xml"}
 # samples of one render and number of renders: three standard errors below 0.5 % of each channel's mean. Nearly all of veach-mis' noise is
 # in one pixel, which shows part of its smallest light and holds a fifth of the picture's energy
 ENOUGH = {"veach-mis": (1280, 64)}
@@ -67,6 +67,15 @@ EMITTERS = {
              "perspective", FOV),
     "directional": ('<emitter type="directional"><vector name="direction" x="-1" y="-2" z="-0.7"/><rgb name="irradiance" value="3, 2, 1"/>'
                     '</emitter><emitter type="constant"><rgb name="radiance" value="0.1, 0.2, 0.3"/></emitter>', "perspective", FOV),
+    "sunsky": ('<emitter type="sunsky"><vector name="sun_direction" x="0.5" y="0.6" z="0.3"/><float name="turbidity" value="4"/>'
+               '<rgb name="albedo" value="0.1, 0.3, 0.2"/><float name="sky_scale" value="10"/><float name="sun_scale" value="5"/>'
+               '<float name="sun_aperture" value="6"/><transform name="to_world"><rotate x="1" angle="-90"/></transform></emitter>',
+               "perspective", FOV),
+    "sun": ('<emitter type="sunsky"><vector name="sun_direction" x="-0.5" y="0.2" z="0.3"/><float name="sky_scale" value="0"/>'
+            '<float name="sun_aperture" value="20"/><transform name="to_world"><rotate x="1" angle="-90"/></transform></emitter>',
+            "perspective", FOV),
+    "sky": ('<emitter type="sunsky"><vector name="sun_direction" x="-0.5" y="0.5" z="-0.3"/><float name="sun_scale" value="0"/>'
+            '<transform name="to_world"><rotate x="1" angle="-90"/></transform></emitter>', "perspective", FOV),
     "disk": (DISK, "perspective", FOV),
     "thinlens": (DISK, "thinlens", FOV + '<float name="aperture_radius" value="0.3"/><float name="focus_distance" value="4"/>'),
     "orthographic": (DISK, "orthographic", ""),
@@ -130,16 +139,23 @@ def prepare(name: str, shared: Path, work: Path) -> Path:
     if name in ROOMS:
         with tarfile.open(shared / f"data/scene-{name}/scene-{name}.tar.xz") as tar:
             tar.extractall(work / name, filter="data")
-        source = next((work / name).rglob("scene.xml"))
+        source = next((work / name).rglob(ROOMS[name]))
         text = source.read_text()
         text = re.sub(r'type="(tent|gaussian)"', 'type="box"', text)
+        # photon maps
+        text = text.replace('name="method" value="sppm"', 'name="method" value="path"')
+        text = re.sub(r'<\w+ name="(photonCount|maxPasses|stepSnapshot|kNN|dualBuffer)"[^>]*/>', "", text)
+        text = re.sub(r'<boolean name="banner"[^>]*/>|<float name="gamma" value="2.2" */>', "", text)
         text = re.sub(r'(name="(?:width|height)" value=)"\d+"', r'\1"$res"', text)
         text = re.sub(r'(name="maxDepth" value=)"-?\d+"', r'\1"$max_depth"', text)
         # Mitsuba 3 refuses what it does not know
         text = re.sub(r'<boolean name="(?:highQualityEdges|high_quality_edges)"[^>]*/>', "", text)
         defaults = '<default name="res" value="128"/><default name="max_depth" value="65"/>'
         out = source.with_name("scene-box.xml")
-        out.write_text(re.sub(r"(<scene[^>]*>)", r"\1" + defaults, text, count=1))
+        text = re.sub(r"(<scene[^>]*>)", r"\1" + defaults, text, count=1)
+        out.write_text(text)
+        if "sunsky" in text:
+            theirs(out).write_text(for_mitsuba(text))
         return out
     if name == "gyroid":
         out = work / "scenes/gyroid.xml"
@@ -160,6 +176,20 @@ def prepare(name: str, shared: Path, work: Path) -> Path:
         return out
     there = ", ".join([*NAMES, *MATERIALS, *EMITTERS])
     raise SystemExit(f"unknown scene {name}; there are {there}; materials or emitters for all of these")
+
+
+def theirs(xml: Path) -> Path:
+    """Where the file that Mitsuba 3 reads lies, if it is another one."""
+    return xml.with_name(xml.stem + "-mitsuba.xml")
+
+
+def for_mitsuba(text: str) -> str:
+    """A scene of 0.6 with a sky, as Mitsuba 3 has to be told the same: z was y, other names, another default; and bilinear textures."""
+    scale = re.search(r'<float name="sunRadiusScale" value="([^"]*)" */>', text)
+    aperture = f'<float name="sun_aperture" value="{0.5358 * float(scale[1])}"/>'
+    up = '<transform name="to_world"><rotate x="1" angle="-90"/></transform><rgb name="albedo" value="0.15"/>'
+    text = re.sub(r'<float name="extEta" value="1" */>', "", text)
+    return text.replace(scale[0], aperture + up).replace('value="trilinear"', 'value="bilinear"')
 
 
 def parameters(xml: Path, size: int, max_depth: int) -> dict:

@@ -118,13 +118,15 @@ fn lights(description: &Description, survey: &Survey) -> String {
     let sky = match &description.environment {
         Some(Environment::Constant(rgb)) => format!(", sky of {rgb:?}"),
         Some(Environment::Map { path, .. }) => format!(", sky from {}", path.display()),
+        Some(Environment::Sky(sky)) => format!(", clear sky of turbidity {}", sky.turbidity),
         None => String::new(),
     };
+    let sun = if description.sun.is_some() { ", sun" } else { "" };
     let beams = match description.beams.len() {
         0 => String::new(),
         _ => format!(", {}", kinds(description.beams.iter().map(beam))),
     };
-    format!("{} of {}{beams}{sky}", count(emits.count() as u64, "shape"), count(primitives, "primitive"))
+    format!("{} of {}{beams}{sky}{sun}", count(emits.count() as u64, "shape"), count(primitives, "primitive"))
 }
 
 /// "3: 2 obj, 1 sphere".

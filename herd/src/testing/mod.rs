@@ -88,6 +88,7 @@ pub fn cornell() -> Description {
         textures: vec![],
         beams: vec![],
         environment: Some(Environment::Constant([0.05, 0.06, 0.08])),
+        sun: None,
         camera: None,
         size: None,
         filter: None,

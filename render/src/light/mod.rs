@@ -10,6 +10,7 @@ mod beam;
 mod map;
 mod sky;
 mod sphere;
+mod sun;
 #[cfg(test)]
 mod tests;
 mod triangle;
@@ -124,7 +125,7 @@ impl Lights {
             sources.push(Source { geometry, emission, probability: 0.0 });
         }
         by_prim.sort_unstable();
-        let sky = Sky::new(world.environment.as_ref(), map);
+        let sky = Sky::new(world, map);
         let power =
             |shape: usize| world.shapes[shape].emission.map_or(0.0, |e| f64::from(luminance(e.into()))) * areas[shape];
         let shapes: Vec<usize> = (0..areas.len()).filter(|&s| areas[s] > 0.0).collect();
@@ -164,7 +165,7 @@ impl Lights {
     /// Whether anything comes from where nothing is met.
     #[inline]
     pub(crate) fn has_sky(&self) -> bool {
-        !matches!(self.sky, Sky::None)
+        !self.sky.is_dark()
     }
 
     /// Radiance from the sky along the unit direction `d`, and the density of [`Lights::sample`] in that direction; both 0 without a sky.

@@ -17,6 +17,7 @@ mod regular;
 mod serialized;
 mod shapes;
 mod sky;
+mod skylight;
 mod source;
 mod spill;
 mod stl;
@@ -35,6 +36,7 @@ pub use options::{
 pub use placement::Placement;
 pub use sky::sky_map;
 pub(crate) use sky::to_map;
+pub(crate) use skylight::PICTURE_TO_SKY;
 pub(crate) use spill::temporary_file;
 pub use stream::{DescriptionSource, StreamOptions};
 pub use survey::{ShapeSurvey, Survey};
@@ -61,12 +63,14 @@ pub fn import(path: &Path, options: &ImportOptions) -> Result<Description, Impor
     place_camera(path, &mut out, up, bare, options)?;
     if let Some(sky) = options.sky {
         out.environment = Some(Environment::Constant(sky));
+        out.sun = None;
     }
     out.environment = out.environment.filter(|sky| match sky {
         Environment::Constant(rgb) => rgb.iter().any(|v| *v > 0.0),
-        Environment::Map { .. } => true,
+        Environment::Map { .. } | Environment::Sky(_) => true,
     });
-    if out.environment.is_none() && out.beams.is_empty() && out.shapes.iter().all(|s| s.emission.is_none()) {
+    let far = out.environment.is_some() || out.sun.is_some();
+    if !far && out.beams.is_empty() && out.shapes.iter().all(|s| s.emission.is_none()) {
         return refuse(
             path,
             "nothing in this scene emits light, its image is black: add an emitter, or pass --light or --sky",

@@ -2,17 +2,22 @@
 
 use rayherd_render::light::{SkyMap, SkyMapError};
 
+use super::skylight;
 use super::vector::dot;
 use crate::ImportError;
 use crate::description::{Affine, Environment};
 use crate::image;
 
-/// Reads the picture of a sky, if that is one. Negative values, which filtering leaves in some pictures, become 0, and a warning says how many.
+/// Reads the picture of a sky, or makes that of a clear one. Negative values, which filtering leaves in some pictures, become 0, and a warning says how many.
 ///
 /// # Errors
 /// As of [`image::read`]; or the picture has fewer than 1 x 2 pixels, or holds NaN or infinity.
 pub fn sky_map(environment: Option<&Environment>) -> Result<Option<SkyMap>, ImportError> {
-    let Some(Environment::Map { path, place, .. }) = environment else { return Ok(None) };
+    let (path, place) = match environment {
+        None | Some(Environment::Constant(_)) => return Ok(None),
+        Some(Environment::Sky(sky)) => return Ok(Some(skylight::picture(sky))),
+        Some(Environment::Map { path, place, .. }) => (path, place),
+    };
     let image = image::read(path, false).map_err(|why| image::error(path, place, &why))?;
     let [width, height] = image.header.size;
     let mut negative = 0u64;
@@ -36,10 +41,15 @@ pub fn sky_map(environment: Option<&Environment>) -> Result<Option<SkyMap>, Impo
 
 /// Rows of the rotation, perhaps mirrored, that undoes `to_world`, which must be a similarity.
 pub(crate) fn to_map(to_world: &Affine) -> [[f32; 3]; 3] {
+    inverse_rotation(to_world).map(|row| row.map(|v| v as f32))
+}
+
+/// The same in f64.
+pub(super) fn inverse_rotation(to_world: &Affine) -> [[f64; 3]; 3] {
     // the inverse of an orthogonal map is its transpose: rows are columns, at unit length
     [0, 1, 2].map(|c| {
         let column = [0, 1, 2].map(|r| to_world.0[r][c]);
         let length = dot(column, column).sqrt();
-        column.map(|v| (v / length) as f32)
+        column.map(|v| v / length)
     })
 }

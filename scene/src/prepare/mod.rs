@@ -36,7 +36,7 @@ use std::time::Duration;
 
 use rayherd_render::bvh::BuildError;
 use rayherd_render::texture::Texture;
-use rayherd_render::world::{Beam, Environment, ShapeInfo, World};
+use rayherd_render::world::{Beam, Environment, ShapeInfo, Sun, World};
 use rayon::prelude::*;
 
 use crate::ImportError;
@@ -298,8 +298,20 @@ fn world(
         environment: description.environment.as_ref().map(|sky| match sky {
             description::Environment::Constant(radiance) => Environment::Constant(*radiance),
             description::Environment::Map { scale, to_world, .. } => {
-                Environment::Map { scale: *scale, to_map: import::to_map(to_world) }
+                Environment::Map { scale: *scale, to_map: import::to_map(to_world), upper: false }
             }
+            description::Environment::Sky(sky) => Environment::Map {
+                scale: sky.scale,
+                to_map: import::to_map(&sky.to_world.after(&import::PICTURE_TO_SKY)),
+                upper: true,
+            },
+        }),
+        sun: description.sun.as_ref().map(|sun| Sun {
+            direction: sun.direction.map(|x| x as f32),
+            up: sun.up.map(|x| x as f32),
+            // as 2 sin^2 of the half: small angles keep their digits
+            cap: (2.0 * libm::sin(0.5 * sun.half_angle) * libm::sin(0.5 * sun.half_angle)) as f32,
+            radiance: sun.radiance,
         }),
         lo: ingested.lo,
         hi: ingested.hi,

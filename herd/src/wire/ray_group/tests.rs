@@ -206,6 +206,7 @@ impl Heap {
             emissive: vec![EmissivePrimitive { prim: 1, shape: 1, geometry: sphere(self.spheres[1]) }],
             beams: vec![],
             environment: Some(Environment::Constant([0.5; 3])),
+            sun: None,
             lo: [-1001.0; 3],
             hi: [1001.0; 3],
             ..World::default()

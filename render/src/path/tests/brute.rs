@@ -110,9 +110,10 @@ impl Scene {
             emissive,
             beams: self.beams.clone(),
             environment: match &self.sky_map {
-                Some((_, to_map)) => Some(Environment::Map { scale: 1.0, to_map: *to_map }),
+                Some((_, to_map)) => Some(Environment::Map { scale: 1.0, to_map: *to_map, upper: false }),
                 None => self.environment.map(Environment::Constant),
             },
+            sun: None,
             lo: lo.to_array(),
             hi: hi.to_array(),
         }

@@ -1,10 +1,11 @@
 //! Light: area emitters of shapes, lights without extent, and the sky.
 
 use super::Converter;
+use super::daylight::Daylight;
 use super::shape::is_similarity;
 use super::xml::{ObjectId, malformed};
 use crate::ImportError;
-use crate::description::{Beam, Environment};
+use crate::description::{Beam, Environment, Place};
 use crate::import::vector::normalize;
 
 impl Converter<'_> {
@@ -42,9 +43,17 @@ impl Converter<'_> {
                 return Ok(());
             }
             plugin @ ("sky" | "sun" | "sunsky") => {
-                self.unsupported(&object.place, format!("emitter \"{plugin}\""), "a constant sky of radiance 1");
-                object.properties.iter().for_each(|p| p.used.set(true));
-                Environment::Constant([1.0; 3])
+                let Daylight { sky, sun, beam } = self.daylight(id, plugin)?;
+                self.leave(id);
+                self.out.beams.extend(beam);
+                if sun.is_some() && self.out.sun.is_some() && !self.options.substitute {
+                    return malformed(&object.place, "a second sun: a scene has one");
+                }
+                self.out.sun = self.out.sun.take().or(sun);
+                match sky {
+                    Some(sky) => return self.environment(sky, &object.place),
+                    None => return Ok(()),
+                }
             }
             plugin => {
                 self.unsupported(&object.place, format!("emitter \"{plugin}\""), "no light");
@@ -55,8 +64,12 @@ impl Converter<'_> {
         // a constant sky is the same from everywhere
         self.ignore(id, &["sampling_weight", "to_world"]);
         self.leave(id);
+        self.environment(environment, &object.place)
+    }
+
+    fn environment(&mut self, environment: Environment, place: &Place) -> Result<(), ImportError> {
         if self.out.environment.is_some() && !self.options.substitute {
-            return malformed(&object.place, "a second environment emitter: a scene has one sky");
+            return malformed(place, "a second environment emitter: a scene has one sky");
         }
         self.out.environment.get_or_insert(environment);
         Ok(())

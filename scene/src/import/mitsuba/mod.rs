@@ -16,6 +16,7 @@
 
 mod bsdf;
 mod coats;
+mod daylight;
 mod emitter;
 mod scene;
 mod sensor;
@@ -232,6 +233,8 @@ fn shorten(text: &str) -> String {
     if text.chars().count() <= 40 { text.into() } else { text.chars().take(40).chain("...".chars()).collect() }
 }
 
+#[cfg(test)]
+mod daylight_tests;
 #[cfg(test)]
 mod emitter_tests;
 #[cfg(test)]

@@ -13,6 +13,8 @@ const FULL_TRANSPORT: &[&str] = &[
     "bdpt",
     "mlt",
     "pssmlt",
+    "ppm",
+    "sppm",
     "erpt",
     "ptracer",
     "prb",

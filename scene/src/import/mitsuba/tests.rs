@@ -326,7 +326,7 @@ fn all_that_is_unsupported_is_listed() {
          <shape type=\"hair\"/>\n\
          <shape type=\"cube\"><ref id=\"p\"/><medium name=\"interior\" type=\"homogeneous\"/></shape>\n\
          <shape type=\"cube\"><ref id=\"d\"/>\n<float name=\"wobble\" value=\"1\"/></shape>\n\
-         <emitter type=\"sunsky\"/>\n\
+         <emitter type=\"envmap\"><string name=\"filename\" value=\"none.hdr\"/></emitter>\n\
          <emitter type=\"projector\"/>\n\
          <wurst/>";
     let Err(ImportError::Unsupported(list)) = scene(text) else { panic!("no list") };
@@ -340,7 +340,7 @@ fn all_that_is_unsupported_is_listed() {
             (6, "shape \"hair\""),
             (7, "medium \"homogeneous\" in shape \"cube\""),
             (9, "property \"wobble\" of shape \"cube\""),
-            (10, "emitter \"sunsky\""),
+            (10, "envmap file \"none.hdr\" (there is no such file)"),
             (11, "emitter \"projector\""),
             (12, "element <wurst>"),
         ]

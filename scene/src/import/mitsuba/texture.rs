@@ -48,7 +48,8 @@ impl Converter<'_> {
             None => self.boolean(id, "raw")?.unwrap_or(false),
         };
         let filter = match self.string(id, "filter_type")? {
-            None | Some(("bilinear", _)) => TexelFilter::Bilinear,
+            // the two of 0.5 and 0.6 differ from bilinear where many texels fall on one pixel: there our samples do their work
+            None | Some(("bilinear" | "trilinear" | "ewa", _)) => TexelFilter::Bilinear,
             Some(("nearest", _)) => TexelFilter::Nearest,
             Some((name, at)) => {
                 self.unsupported(at, format!("filter_type \"{name}\""), "bilinear");

@@ -191,7 +191,7 @@ fn what_is_missing_or_wrong_is_listed() {
     let grey = "<bsdf type=\"diffuse\"/>";
     for (bsdf, what) in [
         (format!("<bsdf type=\"diffuse\">{}</bsdf>", bitmap("reflectance", "<string name=\"wrap_mode\" value=\"zero\"/>")), "wrap_mode \"zero\""),
-        (format!("<bsdf type=\"diffuse\">{}</bsdf>", bitmap("reflectance", "<string name=\"filter_type\" value=\"ewa\"/>")), "filter_type \"ewa\""),
+        (format!("<bsdf type=\"diffuse\">{}</bsdf>", bitmap("reflectance", "<string name=\"filter_type\" value=\"cubic\"/>")), "filter_type \"cubic\""),
         (format!("<bsdf type=\"diffuse\">{}</bsdf>", bitmap("reflectance", "<float name=\"gamma\" value=\"2\"/>")), "gamma 2"),
         ("<bsdf type=\"diffuse\"><texture type=\"bitmap\" name=\"reflectance\"/></bsdf>".into(), "lacks its filename"),
         ("<bsdf type=\"diffuse\"><texture type=\"bitmap\" name=\"reflectance\"><string name=\"filename\" value=\"../../etc/passwd\"/></texture></bsdf>".into(), "etc/passwd"),

@@ -84,6 +84,8 @@ pub(super) struct Document {
     pub unknown: Vec<(Place, String)>,
     /// The canonical folder of the scene: no file outside is read.
     pub folder: PathBuf,
+    /// Whether its version is below 2 (0.5 or 0.6), where some things mean something else.
+    pub old: bool,
     /// Bytes of XML read.
     pub bytes_read: u64,
 }
@@ -96,7 +98,14 @@ impl Document {
         let folder = canonical.parent().map(Path::to_path_buf).unwrap_or_default();
         let mut parameters = Parameters::new(defines);
         let mut reader = Reader {
-            document: Document { objects: vec![], ids: BTreeMap::new(), unknown: vec![], folder, bytes_read: 0 },
+            document: Document {
+                objects: vec![],
+                ids: BTreeMap::new(),
+                unknown: vec![],
+                folder,
+                old: false,
+                bytes_read: 0,
+            },
             including: vec![],
             includes: 0,
         };
@@ -310,6 +319,7 @@ impl Reader {
                 return malformed(&place(&root), message);
             }
             None => {
+                self.document.old = root.attribute("version").is_some_and(|v| v.trim_start().starts_with("0."));
                 self.document.objects.push(Object {
                     class: "scene".into(),
                     plugin: "scene".into(),
