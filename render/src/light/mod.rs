@@ -1,18 +1,23 @@
 //! Light sources: choosing one, a point on it, and the density with which that happens.
 //!
-//! A source is a primitive that emits, a [beam](crate::world::Beam), or the sky. One is chosen with a probability that does not depend on
-//! where it is seen from: a primitive's is its shape's share times its share of the shape's area. Nine tenths of the shares of shapes and
-//! beams go by power (luminance x area x pi), one tenth is dealt evenly. The probabilities are multiples of 2^-32, a cumulative table of
-//! integers, so one 32-bit number chooses exactly by them and both sides of MIS see the same ones.
-//! A primitive whose share is below 2^-32 is never chosen; its density is 0, and MIS leaves it to the BSDF.
+//! A source is a primitive that emits, a [beam](crate::world::Beam), or the sky. Sky and parallel light have shares that do not depend on
+//! where they are seen from; so has what is local where it is but one shape of at most [`FEW`] triangles or one sphere. Of more, a [tree]
+//! chooses by the point that is lit. Nine tenths of the shares of shapes and beams go by power (luminance x area x pi), one tenth is dealt
+//! evenly; a primitive of a shape has its share of the area. The probabilities are multiples of 2^-32, intervals of integers, so one 32-bit
+//! number chooses exactly by them and both sides of MIS see the same ones.
+//! Without a tree, a primitive whose share is below 2^-32 is never chosen; its density is 0, and MIS leaves it to the BSDF.
 
 mod beam;
+mod bounds;
 mod map;
 mod sky;
 mod sphere;
 mod sun;
 #[cfg(test)]
 mod tests;
+mod tree;
+#[cfg(test)]
+mod tree_tests;
 mod triangle;
 
 use std::sync::Arc;
@@ -22,9 +27,11 @@ use glam::Vec3;
 use crate::math::{luminance, unit};
 use crate::ray::PrimId;
 use crate::world::{Beam, Primitive, World};
+use bounds::Bounds;
 pub use map::{SkyMap, SkyMapError};
 use sky::Sky;
 pub use sphere::SphereLight;
+use tree::Tree;
 pub use triangle::TriangleLight;
 
 /// Share of the choice that is dealt evenly over the sources.
@@ -35,9 +42,14 @@ const SKY_LIMIT: f64 = 0.5;
 /// Tables of every source of a world.
 #[derive(Clone, Debug)]
 pub struct Lights {
+    /// Those of the tree first, if there is one.
     sources: Vec<Source>,
-    /// Upper ends of the sources' intervals of 32-bit numbers; the last is 2^32.
+    /// Chooses by the point among the first sources, by the numbers below its share.
+    tree: Option<Tree>,
+    /// Upper ends of the intervals of 32-bit numbers of the sources that are not in the tree; the last is 2^32.
     ends: Vec<u64>,
+    /// Number of sources in the tree.
+    in_tree: usize,
     /// By ascending id: the primitive's number in `sources`.
     by_prim: Vec<(PrimId, u32)>,
     sky: Sky,
@@ -67,8 +79,16 @@ struct Source {
     geometry: Geometry,
     /// Of the sky its mean.
     emission: Vec3,
-    /// With which it is chosen; what the integers in `Lights::ends` say.
+    /// With which it is chosen; what the integers in `Lights::ends` say. Of the tree's sources 0: it depends on the point.
     probability: f32,
+}
+
+/// What a number chose.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Choice {
+    source: usize,
+    /// With which it is chosen at this point.
+    pub probability: f32,
 }
 
 #[derive(Clone, Debug)]
@@ -101,6 +121,17 @@ impl Lights {
 
     /// Tables for a world and the picture of its sky, which is dark where the world wants one and there is none.
     pub fn with_sky_map(world: &World, map: Option<Arc<SkyMap>>) -> Lights {
+        Lights::build(world, map, |sources, shapes| sources.len() > 1 && (shapes > 1 || sources.len() > FEW))
+    }
+
+    /// The plain twin: a choice by power alone.
+    #[cfg(test)]
+    pub(crate) fn by_power(world: &World, map: Option<Arc<SkyMap>>) -> Lights {
+        Lights::build(world, map, |_, _| false)
+    }
+
+    /// `wants_tree` is told the local sources, and of how many shapes and beams they are.
+    fn build(world: &World, map: Option<Arc<SkyMap>>, wants_tree: impl Fn(&[Bounds], usize) -> bool) -> Lights {
         let mut sources = Vec::new();
         let mut by_prim = Vec::new();
         let mut areas = vec![0.0f64; world.shapes.len()];
@@ -137,7 +168,10 @@ impl Lights {
         let sky_share = sky.mean().map_or(0.0, |mean| sky_share(mean, radius2, total, others));
         let share = |power: f64| (1.0 - sky_share) * ((1.0 - EVEN) * power / total + EVEN / others as f64);
         let mut weights: Vec<f64> = chosen.iter().map(|&(s, area)| share(power(s)) * area / areas[s]).collect();
-        for (beam, power) in beams {
+        // what is local before what is infinitely far away
+        let (local, far): (Vec<_>, Vec<_>) = beams.into_iter().partition(|b| !matches!(b.0, Beam::Directional { .. }));
+        let parts = shapes.len() + local.len();
+        for (beam, power) in local.into_iter().chain(far) {
             weights.push(share(power));
             sources.push(Source { geometry: Geometry::Beam(beam), emission: Vec3::ZERO, probability: 0.0 });
         }
@@ -145,16 +179,29 @@ impl Lights {
             weights.push(sky_share);
             sources.push(Source { geometry: Geometry::Sky, emission: mean, probability: 0.0 });
         }
-        let ends = integer_ends(&weights);
-        let mut start = 0;
-        for (source, &end) in sources.iter_mut().zip(&ends) {
-            source.probability = ((end - start) as f64 / 4_294_967_296.0) as f32;
+        let bounds: Vec<Bounds> = sources.iter().map_while(Bounds::new).collect();
+        let (mut tree, mut in_tree) = (None, 0);
+        let mut ends = Vec::new();
+        if wants_tree(&bounds, parts) {
+            in_tree = bounds.len();
+            // the tree as one weight, before those that are not in it
+            let local: f64 = weights[..in_tree].iter().sum();
+            weights.splice(..in_tree, [local]);
+            ends = integer_ends(&weights);
+            tree = Some(Tree::new(&bounds, ends.remove(0)));
+        } else {
+            ends.append(&mut integer_ends(&weights));
+        }
+        let mut start = tree.as_ref().map_or(0, Tree::share);
+        for (source, &end) in sources[in_tree..].iter_mut().zip(&ends) {
+            source.probability = probability(end - start);
             start = end;
         }
         let sky_probability = sky.mean().map_or(0.0, |_| sources.last().map_or(0.0, |s| s.probability));
         let only_triangles = !sources.is_empty() && sources.iter().all(|s| matches!(s.geometry, Geometry::Triangle(_)));
-        let few = if only_triangles && sources.len() <= FEW { few_triangles(&sources, &ends) } else { Vec::new() };
-        Lights { sources, ends, by_prim, sky, sky_probability, only_triangles, few }
+        let is_few = tree.is_none() && only_triangles && sources.len() <= FEW;
+        let few = if is_few { few_triangles(&sources, &ends) } else { Vec::new() };
+        Lights { sources, tree, ends, in_tree, by_prim, sky, sky_probability, only_triangles, few }
     }
 
     /// Whether there is nothing to sample.
@@ -179,8 +226,14 @@ impl Lights {
     /// `o` its back: that sample is worth 0.
     #[inline]
     pub fn sample(&self, o: Vec3, choice: u32, place: [u32; 2]) -> Option<LightSample> {
-        let i = self.choose(choice)?;
-        let source = &self.sources[i];
+        self.sample_chosen(self.choose(o, choice)?, o, place)
+    }
+
+    /// The same of what was chosen, for callers that choose for many at once.
+    #[inline]
+    pub(crate) fn sample_chosen(&self, choice: Choice, o: Vec3, place: [u32; 2]) -> Option<LightSample> {
+        let Choice { source, probability } = choice;
+        let source = &self.sources[source];
         let u = place.map(unit);
         let (d, tmax, pdf) = match &source.geometry {
             Geometry::Triangle(t) => t.sample(o, u)?,
@@ -188,25 +241,24 @@ impl Lights {
             Geometry::Beam(beam) => {
                 let (d, tmax, irradiance) = beam::sample(beam, o)?;
                 let radiance = irradiance * beam::SINGLE;
-                return Some(LightSample { d, tmax, radiance, pdf: beam::SINGLE * source.probability });
+                return Some(LightSample { d, tmax, radiance, pdf: beam::SINGLE * probability });
             }
             Geometry::Sky => {
                 let (d, radiance, pdf) = self.sky.sample(place)?;
-                return Some(LightSample { d, tmax: f32::INFINITY, radiance, pdf: pdf * source.probability });
+                return Some(LightSample { d, tmax: f32::INFINITY, radiance, pdf: pdf * probability });
             }
         };
-        Some(LightSample { d, tmax, radiance: source.emission, pdf: pdf * source.probability })
+        Some(LightSample { d, tmax, radiance: source.emission, pdf: pdf * probability })
     }
 
-    /// What a number chooses, for callers that sample many at once: the triangle, or `None` for another kind of source; radiance; probability.
+    /// A source that was chosen, if it is a triangle, and its radiance.
     #[inline(always)]
-    pub(crate) fn chosen(&self, choice: u32) -> Option<(Option<&TriangleLight>, Vec3, f32)> {
-        let source = &self.sources[self.choose(choice)?];
-        let triangle = match &source.geometry {
-            Geometry::Triangle(t) => Some(t),
+    pub(crate) fn triangle(&self, choice: Choice) -> Option<(&TriangleLight, Vec3)> {
+        let source = &self.sources[choice.source];
+        match &source.geometry {
+            Geometry::Triangle(t) => Some((t, source.emission)),
             _ => None,
-        };
-        Some((triangle, source.emission, source.probability))
+        }
     }
 
     /// Whether every source is a triangle.
@@ -226,25 +278,37 @@ impl Lights {
     #[inline]
     pub fn pdf(&self, prim: PrimId, o: Vec3, t: f32, cos: f32) -> f32 {
         let Ok(i) = self.by_prim.binary_search_by_key(&prim, |e| e.0) else { return 0.0 };
-        let source = &self.sources[self.by_prim[i].1 as usize];
+        let number = self.by_prim[i].1 as usize;
+        let source = &self.sources[number];
         let pdf = match &source.geometry {
             Geometry::Triangle(s) => s.pdf(t, cos),
             Geometry::Sphere(s) => s.pdf(o, t, cos),
             Geometry::Beam(_) | Geometry::Sky => 0.0,
         };
-        pdf * source.probability
+        match &self.tree {
+            Some(tree) => pdf * probability(tree.numbers(o, number)),
+            None => pdf * source.probability,
+        }
     }
 
-    /// The source in whose interval the number lies.
+    /// The source in whose interval the number lies at the point; `None` where nothing shines there.
     #[inline]
-    fn choose(&self, number: u32) -> Option<usize> {
+    pub(crate) fn choose(&self, o: Vec3, number: u32) -> Option<Choice> {
+        let number = u64::from(number);
+        if let Some(tree) = &self.tree
+            && number < tree.share()
+        {
+            let (source, numbers) = tree.choose(o, number)?;
+            return Some(Choice { source, probability: probability(numbers) });
+        }
         let i = match self.ends.len() {
             0 => return None,
             // few: count the ends passed, without branches to mispredict
-            n if n <= 8 => self.ends.iter().filter(|&&end| end <= u64::from(number)).count(),
-            _ => self.ends.partition_point(|&end| end <= u64::from(number)),
+            n if n <= FEW => self.ends.iter().filter(|&&end| end <= number).count(),
+            _ => self.ends.partition_point(|&end| end <= number),
         };
-        (i < self.ends.len()).then_some(i)
+        let source = self.in_tree + i;
+        (i < self.ends.len()).then(|| Choice { source, probability: self.sources[source].probability })
     }
 }
 
@@ -256,6 +320,12 @@ impl Geometry {
             Geometry::Beam(_) | Geometry::Sky => 0.0,
         }
     }
+}
+
+/// Of so many of the 2^32 numbers.
+#[inline]
+fn probability(numbers: u64) -> f32 {
+    (numbers as f64 / 4_294_967_296.0) as f32
 }
 
 /// Sources that are triangles, with the beginnings of their intervals; without those that begin, and end, at 2^32.

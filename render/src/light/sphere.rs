@@ -33,6 +33,16 @@ impl SphereLight {
         SphereLight { center: center.into(), radius, flipped }
     }
 
+    /// Centre.
+    pub(super) fn center(&self) -> Vec3 {
+        self.center
+    }
+
+    /// Radius.
+    pub(super) fn radius(&self) -> f32 {
+        self.radius
+    }
+
     /// Area.
     pub fn area(&self) -> f32 {
         4.0 * PI * self.radius * self.radius

@@ -8,7 +8,7 @@ use crate::testing::{Rng, chi_square, integrate_bins, sphere_bin};
 use crate::world::{EmissivePrimitive, Environment, ShapeInfo};
 
 /// A world of emissive primitives, each of the shape and the radiance given.
-fn world(primitives: &[(Primitive, u32)], radiances: &[f32], environment: Option<[f32; 3]>) -> World {
+pub(super) fn world(primitives: &[(Primitive, u32)], radiances: &[f32], environment: Option<[f32; 3]>) -> World {
     World {
         materials: vec![Material::new("", Bsdf::Diffuse { reflectance: [0.5; 3] }, true)],
         shapes: radiances
@@ -122,7 +122,7 @@ fn both_sides_agree() {
         let choice = rng.u32();
         let Some(s) = lights.sample(o, choice, [rng.u32(), rng.u32()]) else { continue };
         assert!((s.d.length() - 1.0).abs() < 1e-6 && s.pdf > 0.0 && s.pdf.is_finite() && s.tmax >= 0.0);
-        let i = lights.choose(choice).unwrap();
+        let i = lights.choose(o, choice).unwrap().source;
         if i >= primitives.len() {
             assert!((s.pdf / lights.sky(s.d).1 - 1.0).abs() < 1e-6 && s.tmax == f32::INFINITY);
             continue;
@@ -161,21 +161,22 @@ fn choice_is_by_power() {
     let right = |x: f32, s: f32| Primitive::Triangle([[x, 2.0, 0.0], [x + s, 2.0, 0.0], [x, 2.0, s]]);
     // shape 0: areas 0.5 and 2; shape 1: area 0.5 and twice the radiance
     let primitives = [(right(0.0, 1.0), 0), (right(2.0, 2.0), 0), (right(5.0, 1.0), 1)];
-    let lights = Lights::new(&world(&primitives, &[1.0, 2.0], None));
+    let lights = Lights::by_power(&world(&primitives, &[1.0, 2.0], None), None);
     let power = [2.5, 1.0];
     let share = |s: usize| 0.9 * power[s] / 3.5 + 0.1 / 2.0;
     let expected = [share(0) * 0.2, share(0) * 0.8, share(1)];
     let n = 100_000u32;
     let mut counts = [0.0; 3];
     for i in 0..n {
-        counts[lights.choose((u64::from(i) * (1 << 32) / u64::from(n)) as u32).unwrap()] += 1.0;
+        let number = (u64::from(i) * (1 << 32) / u64::from(n)) as u32;
+        counts[lights.choose(Vec3::ZERO, number).unwrap().source] += 1.0;
     }
     for i in 0..3 {
         assert!((counts[i] / f64::from(n) - expected[i]).abs() < 2e-5, "{counts:?} {expected:?}");
         assert!((f64::from(lights.sources[i].probability) - expected[i]).abs() < 1e-7);
     }
     assert!(lights.sample(Vec3::new(0.0, 3.0, 0.0), 0, [1 << 31; 2]).is_none());
-    assert_eq!(lights.choose(u32::MAX), Some(2));
+    assert_eq!(lights.choose(Vec3::ZERO, u32::MAX).map(|c| c.source), Some(2));
     assert_eq!(lights.pdf(11, Vec3::ZERO, 1.0, 1.0), 0.0);
 }
 

@@ -9,7 +9,7 @@ use glam::Vec3;
 use super::diffuse::{Fate, cosine_direction, onwards, snap, towards_light};
 use super::interaction::Flat;
 use super::{Context, Outcome, PathRay, ShadowRay, wide};
-use crate::light::{FewTriangles, TriangleLight};
+use crate::light::{Choice, FewTriangles, TriangleLight};
 use crate::math::{UnitDir, offset_origin, unit};
 use crate::ray::{PathKey, Ray};
 use crate::sampler::{BSDF, LIGHT, LIGHT_CHOICE, ROULETTE, Streams};
@@ -77,6 +77,7 @@ pub(super) struct Block {
     /// The bits that `place` was made from.
     place_bits: [[u32; N]; 2],
     choice: [u32; N],
+    chosen: [Option<Choice>; N],
     roulette: [bool; N],
     // of the light chosen
     light_p0: Lanes3,
@@ -130,6 +131,7 @@ impl Default for Block {
             place: [lanes; 2],
             place_bits: [[0; N]; 2],
             choice: [0; N],
+            chosen: [None; N],
             roulette: [false; N],
             light_p0: Lanes3::ZERO,
             light_e1: Lanes3::ZERO,
@@ -261,9 +263,11 @@ impl Block {
             return self.choose_of_few(few);
         }
         for i in 0..self.len {
-            let Some((Some(triangle), radiance, probability)) = context.lights.chosen(self.choice[i]) else {
-                continue;
-            };
+            // where a vertex passes there is no point to choose for
+            self.chosen[i] =
+                if self.passes[i] { None } else { context.lights.choose(self.origin.get(i), self.choice[i]) };
+            let Some(choice) = self.chosen[i] else { continue };
+            let Some((triangle, radiance)) = context.lights.triangle(choice) else { continue };
             self.light_p0.set(i, triangle.p0);
             self.light_e1.set(i, triangle.e1);
             self.light_e2.set(i, triangle.e2);
@@ -271,7 +275,7 @@ impl Block {
             self.light_area[i] = triangle.area;
             self.light_error[i] = triangle.error;
             self.radiance.set(i, radiance);
-            self.probability[i] = probability;
+            self.probability[i] = choice.probability;
         }
     }
 
@@ -325,18 +329,22 @@ impl Block {
         }
     }
 
-    /// Sources that are no triangles, one by one.
+    /// Sources that are no triangles, one by one; and where nothing was chosen there is no light.
     #[inline(always)]
     fn other_lights(&mut self, context: &Context) {
-        if context.lights.only_triangles() {
+        if context.lights.few_triangles().is_some() {
             return;
         }
         for i in 0..self.len {
-            if matches!(context.lights.chosen(self.choice[i]), Some((Some(_), ..))) {
+            let Some(choice) = self.chosen[i] else {
+                self.lit[i] = false;
+                continue;
+            };
+            if context.lights.only_triangles() || context.lights.triangle(choice).is_some() {
                 continue;
             }
             let place = [self.place_bits[0][i], self.place_bits[1][i]];
-            let light = context.lights.sample(self.origin.get(i), self.choice[i], place);
+            let light = context.lights.sample_chosen(choice, self.origin.get(i), place);
             self.lit[i] = light.is_some();
             if let Some(light) = light {
                 self.light_d.set(i, light.d);

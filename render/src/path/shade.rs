@@ -304,7 +304,9 @@ pub(super) fn scatter_plain(
         let (from, light) = match light {
             Some(light) if bsdf.transmits() && light.d.dot(at.normal) < 0.0 => {
                 let beyond = at.origin_beyond();
-                (beyond, context.lights.sample(beyond, numbers[LIGHT_CHOICE], place))
+                // the choice depends on the point: at an end of an interval it may fall on another source, perhaps in front
+                let light = context.lights.sample(beyond, numbers[LIGHT_CHOICE], place);
+                (beyond, light.filter(|light| light.d.dot(at.normal) < 0.0))
             }
             light => (origin, light),
         };

@@ -1,0 +1,203 @@
+//! The light tree against its plain twin: every source walked.
+
+use glam::DVec3;
+
+use super::tests::world;
+use super::*;
+use crate::testing::{Rng, chi_square};
+use crate::world::Environment;
+
+const ALL: u64 = 1 << 32;
+
+/// Small sources of every kind, all over [-2, 2]^3: triangles, spheres, points, spots.
+fn motley(n: usize, rng: &mut Rng) -> World {
+    let mut primitives = Vec::new();
+    let mut radiances = Vec::new();
+    let mut beams = Vec::new();
+    for i in 0..n {
+        let at = rng.vec3(2.0);
+        let strength = libm::expf(rng.range(-4.0, 3.0));
+        match i % 4 {
+            0 | 1 => {
+                let (a, b) = (at + rng.vec3(0.1), at + rng.vec3(0.1));
+                primitives.push((Primitive::Triangle([at.into(), a.into(), b.into()]), radiances.len() as u32));
+                radiances.push(100.0 * strength);
+            }
+            2 => {
+                let sphere = Primitive::Sphere { center: at.into(), radius: rng.range(0.01, 0.1), flipped: i % 8 == 2 };
+                primitives.push((sphere, radiances.len() as u32));
+                radiances.push(50.0 * strength);
+            }
+            _ if i % 8 == 3 => beams.push(Beam::Point { position: at.into(), intensity: [strength; 3] }),
+            _ => {
+                let beam = rng.range(0.01, 1.0);
+                let cutoff = beam + rng.range(0.01, 1.5);
+                let axis = rng.direction().into();
+                beams.push(Beam::Spot { position: at.into(), axis, intensity: [strength; 3], beam, cutoff });
+            }
+        }
+    }
+    World { beams, ..world(&primitives, &radiances, None) }
+}
+
+/// How many numbers choose each source at a point.
+fn numbers(lights: &Lights, o: Vec3) -> Vec<u64> {
+    let tree = lights.tree.as_ref().expect("there are several");
+    (0..lights.in_tree).map(|i| tree.numbers(o, i)).collect()
+}
+
+/// A source that sends nothing to `o`, whatever place on it is taken: by its definition, in f64.
+fn is_dark(source: &Source, o: Vec3) -> bool {
+    let o = o.as_dvec3();
+    match &source.geometry {
+        Geometry::Triangle(t) => {
+            let (e1, e2) = (t.e1.as_dvec3(), t.e2.as_dvec3());
+            e1.cross(e2).dot(o - t.p0.as_dvec3()) <= 0.0
+        }
+        Geometry::Sphere(_) | Geometry::Beam(Beam::Point { .. }) => false,
+        Geometry::Beam(Beam::Spot { position, axis, cutoff, .. }) => {
+            let d = o - Vec3::from(*position).as_dvec3();
+            let axis: DVec3 = Vec3::from(*axis).as_dvec3();
+            d.normalize().dot(axis.normalize()) <= f64::from(*cutoff).cos()
+        }
+        _ => unreachable!("not in a tree"),
+    }
+}
+
+/// The intervals fill the tree's share exactly, but for what is dark; whoever is not dark has one, however weak it is; and what a number chooses
+/// is the source in whose interval it lies, with the probability that a hit there is told.
+#[test]
+fn intervals_are_exact_and_leave_out_only_the_dark() {
+    let mut rng = Rng(31);
+    let (mut left_out, mut all) = (0, 0);
+    for n in [2, 3, 10, 100, 1000] {
+        let world =
+            World { environment: [None, Some(Environment::Constant([0.5; 3]))][n % 2].clone(), ..motley(n, &mut rng) };
+        let lights = Lights::new(&world);
+        let share = lights.tree.as_ref().map_or(0, Tree::share);
+        assert_eq!(share == ALL, n % 2 == 0, "the sky has the rest");
+        let most = 200_000 / n.max(100);
+        for k in 0..most {
+            // far away, among them, and just at one
+            let o = match (k % 3, &lights.sources[k % lights.in_tree].geometry) {
+                (0, _) => rng.vec3(1000.0),
+                (1, Geometry::Triangle(t)) => t.p0 + (t.e1 + t.e2) * 0.3 + t.normal * rng.range(-1e-3, 1e-3),
+                _ => rng.vec3(2.0),
+            };
+            let numbers = numbers(&lights, o);
+            let dark: Vec<bool> = lights.sources[..lights.in_tree].iter().map(|s| is_dark(s, o)).collect();
+            for (i, (&count, &dark)) in numbers.iter().zip(&dark).enumerate() {
+                assert!(dark || count > 0, "{o}: source {i} of {n} shines there and is never chosen");
+                left_out += u64::from(count == 0);
+                all += 1;
+            }
+            let sum: u64 = numbers.iter().sum();
+            assert!(sum <= share);
+            for _ in 0..20 {
+                let number = rng.u32();
+                match lights.choose(o, number) {
+                    Some(Choice { source, probability: said }) if source < lights.in_tree => {
+                        assert!(u64::from(number) < share);
+                        assert_eq!(said.to_bits(), probability(numbers[source]).to_bits());
+                    }
+                    Some(_) => assert!(u64::from(number) >= share),
+                    None => assert!(sum < share),
+                }
+            }
+        }
+    }
+    println!("{left_out} of {all} left out");
+    assert!(left_out * 10 > all, "{left_out} of {all}");
+}
+
+/// Counts of what random numbers choose, against the intervals' lengths.
+#[test]
+fn choices_follow_their_probabilities() {
+    let mut rng = Rng(32);
+    let lights = Lights::new(&motley(200, &mut rng));
+    for _ in 0..10 {
+        let o = rng.vec3(3.0);
+        let numbers = numbers(&lights, o);
+        let samples = 200_000;
+        let mut counts = vec![0.0; numbers.len() + 1];
+        for _ in 0..samples {
+            counts[lights.choose(o, rng.u32()).map_or(numbers.len(), |c| c.source)] += 1.0;
+        }
+        let rest = ALL - numbers.iter().sum::<u64>();
+        let share = |n: u64| n as f64 / ALL as f64 * f64::from(samples);
+        let expected: Vec<f64> = numbers.iter().copied().chain([rest]).map(share).collect();
+        assert!(counts.iter().zip(&expected).all(|(c, e)| *e > 0.0 || *c == 0.0));
+        chi_square(&counts, &expected);
+    }
+}
+
+/// What arrives at a point on a surface that faces each light alike, estimated by one sample: mean and variance, by walking every source.
+fn estimate(lights: &Lights, o: Vec3, rng: &mut Rng, samples: u32) -> (f64, f64) {
+    let (mut sum, mut squares) = (0.0, 0.0);
+    for _ in 0..samples {
+        let value = lights
+            .sample(o, rng.u32(), [rng.u32(), rng.u32()])
+            .map_or(0.0, |s| f64::from(s.radiance.x) / f64::from(s.pdf));
+        sum += value;
+        squares += value * value;
+    }
+    let (mean, n) = (sum / f64::from(samples), f64::from(samples));
+    (mean, (squares / n - mean * mean) / n)
+}
+
+/// The same mean as by power within 3 standard errors in nearly all places (4.5 in each), with half the variance.
+#[test]
+fn the_mean_is_that_by_power_and_the_variance_less() {
+    let mut rng = Rng(33);
+    let world = motley(1000, &mut rng);
+    let (tree, power) = (Lights::new(&world), Lights::by_power(&world, None));
+    let (mut beyond, mut gain, places) = (0, 0.0, 60);
+    for _ in 0..places {
+        let o = rng.vec3(2.0);
+        let (a, va) = estimate(&tree, o, &mut rng, 40_000);
+        let (b, vb) = estimate(&power, o, &mut rng, 40_000);
+        let z = (a - b).abs() / (va + vb).sqrt();
+        assert!(z < 4.5, "{o}: {a} {b}, {z} standard errors");
+        beyond += u32::from(z > 3.0);
+        gain += (vb / va).ln() / f64::from(places);
+    }
+    println!("{beyond} of {places} beyond 3 standard errors; variance {} times less", gain.exp());
+    assert!(beyond <= 2 && gain.exp() > 1.8, "{beyond} {}", gain.exp());
+}
+
+/// A room's lamp of two triangles, or one sphere, is chosen from as ever; a second lamp makes a tree.
+#[test]
+fn one_lamp_needs_no_tree() {
+    let quad = [
+        (Primitive::Triangle([[0.0, 1.0, 0.0], [1.0, 1.0, 0.0], [0.0, 1.0, 1.0]]), 0),
+        (Primitive::Triangle([[1.0, 1.0, 0.0], [1.0, 1.0, 1.0], [0.0, 1.0, 1.0]]), 0),
+    ];
+    let one = Lights::new(&world(&quad, &[1.0], None));
+    assert!(one.tree.is_none() && one.few_triangles().is_some());
+    let ball = (Primitive::Sphere { center: [0.0; 3], radius: 1.0, flipped: false }, 0);
+    assert!(Lights::new(&world(&[ball], &[1.0], Some([1.0; 3]))).tree.is_none());
+    let two = Lights::new(&world(&[quad[0], quad[1], (ball.0, 1)], &[1.0, 1.0], None));
+    assert!(two.tree.is_some() && two.few_triangles().is_none());
+}
+
+/// Lights in one place, on a line, of powers from 1e-30 to 1e30, and points that are none: every choice is a source with a probability.
+#[test]
+fn odd_trees() {
+    let mut rng = Rng(34);
+    let point = |x: f32, i: f32| Beam::Point { position: [x, 0.0, 0.0], intensity: [i; 3] };
+    let cases: [Vec<Beam>; 4] = [
+        (0..300).map(|_| point(1.0, 1.0)).collect(),
+        (0..300).map(|i| point(i as f32, 1.0)).collect(),
+        (0..60).map(|i| point(libm::exp2f(i as f32), 1.0)).collect(),
+        (0..60).map(|i| point(i as f32, libm::exp10f(i as f32 - 30.0))).collect(),
+    ];
+    for beams in cases {
+        let lights = Lights::new(&World { beams, ..world(&[], &[], None) });
+        for o in [Vec3::ZERO, Vec3::X, Vec3::splat(f32::MAX), Vec3::splat(1e30), Vec3::NAN, rng.vec3(50.0)] {
+            let numbers = numbers(&lights, o);
+            assert_eq!(numbers.iter().sum::<u64>(), ALL, "{o}");
+            assert!(numbers.iter().all(|&n| n > 0), "{o}: {numbers:?}");
+            assert!(lights.choose(o, rng.u32()).is_some_and(|c| c.probability > 0.0));
+        }
+    }
+}
