@@ -52,11 +52,15 @@ impl World {
             next = bitmap.tiles().end;
         }
         let (materials, textures) = (self.materials.len(), self.textures.len());
-        for material in &self.materials {
+        for (i, material) in self.materials.iter().enumerate() {
             let Some(detail) = &material.detail else { continue };
-            let back = detail.back.is_none_or(|m| (m as usize) < materials);
-            if !back || detail.textures().any(|t| t as usize >= textures) {
-                return Err(format!("material {:?} names a texture or material that it lacks", material.name));
+            // of one above itself it may be part in turn, without end
+            let above = detail.materials().any(|m| m as usize >= i);
+            if above || detail.textures().any(|t| t as usize >= textures) {
+                return Err(format!(
+                    "material {:?} names a texture that is not there, or a material that is not above it",
+                    material.name
+                ));
             }
         }
         if self.shapes.iter().any(|s| s.material as usize >= materials)

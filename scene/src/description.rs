@@ -5,7 +5,7 @@ use std::path::PathBuf;
 pub use rayherd_render::camera::Projection;
 pub use rayherd_render::filter::Filter;
 pub use rayherd_render::material::{
-    Amount, Bsdf, Detail, Distribution, Material, Relief, ReliefKind, Slot, Textured, Transmittance,
+    Amount, Blend, Bsdf, Detail, Distribution, Material, Principled, Relief, ReliefKind, Slot, Textured, Transmittance,
 };
 pub use rayherd_render::texture::{Checkerboard, Filter as TexelFilter, UvMap, Wrap};
 use serde::{Deserialize, Serialize};

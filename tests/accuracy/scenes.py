@@ -31,6 +31,13 @@ MATERIALS = {
     '<float name="alpha" value="0.2"/></bsdf>',
     "roughplastic-ggx": '<bsdf type="roughplastic"><rgb name="diffuse_reflectance" value="0.9, 0.5, 0.1"/>'
     '<float name="alpha" value="0.4"/><string name="distribution" value="ggx"/><boolean name="nonlinear" value="true"/></bsdf>',
+    "principled": '<bsdf type="principled"><rgb name="base_color" value="0.8, 0.4, 0.1"/><float name="roughness" value="0.4"/>'
+    '<float name="metallic" value="0.3"/><float name="clearcoat" value="0.6"/><float name="sheen" value="0.5"/></bsdf>',
+    "principled-glass": '<bsdf type="principled"><rgb name="base_color" value="0.9, 0.8, 0.6"/><float name="roughness" value="0.3"/>'
+    '<float name="spec_trans" value="0.8"/><float name="eta" value="1.5"/></bsdf>',
+    "blendbsdf": '<bsdf type="blendbsdf"><float name="weight" value="0.3"/><bsdf type="diffuse">'
+    '<rgb name="reflectance" value="0.8, 0.5, 0.2"/></bsdf><bsdf type="roughconductor"><string name="material" value="Cu"/>'
+    '<float name="alpha" value="0.3"/></bsdf></bsdf>',
 }
 
 SMALL = """<scene version="3.0.0">

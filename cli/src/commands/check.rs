@@ -8,7 +8,9 @@ use std::process::ExitCode;
 use clap::Args;
 use rayherd_api::{RenderJob, RenderJobSpec};
 use rayherd_herd::job::spec::import_options;
-use rayherd_scene::description::{Beam, Bsdf, Description, Environment, Geometry, MeshFormat, Projection, TextureKind};
+use rayherd_scene::description::{
+    Amount, Beam, Bsdf, Description, Environment, Geometry, Material, MeshFormat, Projection, TextureKind,
+};
 use rayherd_scene::import::{ImportOptions, Survey, import, sky_map};
 
 use super::{print, size};
@@ -83,7 +85,7 @@ fn tell(scene: &str, description: &Description, survey: &Survey) -> String {
     if lo[0] <= hi[0] {
         line("box", format!("{lo:.4?} to {hi:.4?}"));
     }
-    line("materials", kinds(description.materials.iter().map(|m| bsdf(&m.bsdf))));
+    line("materials", kinds(description.materials.iter().map(material)));
     if !description.textures.is_empty() {
         let kinds = kinds(description.textures.iter().map(|t| texture(&t.kind)));
         line("textures", format!("{kinds}; {} of texels", size(survey.texture_bytes())));
@@ -168,8 +170,13 @@ fn texture(kind: &TextureKind) -> &'static str {
     }
 }
 
-fn bsdf(bsdf: &Bsdf) -> &'static str {
-    match bsdf {
+fn material(material: &Material) -> &'static str {
+    match &material.detail {
+        Some(detail) if detail.blend.is_some() => return "blend",
+        Some(detail) if detail.opacity == Amount::Constant(0.0) => return "null",
+        _ => {}
+    }
+    match material.bsdf {
         Bsdf::Diffuse { .. } => "diffuse",
         Bsdf::Conductor { .. } => "conductor",
         Bsdf::RoughConductor { .. } => "rough conductor",
@@ -178,5 +185,7 @@ fn bsdf(bsdf: &Bsdf) -> &'static str {
         Bsdf::RoughDielectric { .. } => "rough dielectric",
         Bsdf::Plastic { .. } => "plastic",
         Bsdf::RoughPlastic { .. } => "rough plastic",
+        Bsdf::Phong { .. } => "phong",
+        Bsdf::Principled(_) => "principled",
     }
 }

@@ -4,7 +4,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::{Bsdf, Material};
+use super::{Bsdf, Material, Principled};
 use crate::texture::{Texture, Textures};
 
 /// A parameter of a [`Bsdf`] that a texture may give.
@@ -22,6 +22,26 @@ pub enum Slot {
     AlphaU,
     /// Roughness along v.
     AlphaV,
+    /// One of [`super::Principled`]'s numbers.
+    Roughness,
+    /// Likewise.
+    Anisotropic,
+    /// Likewise.
+    Metallic,
+    /// Likewise.
+    SpecTrans,
+    /// Likewise.
+    SpecTint,
+    /// Likewise.
+    Sheen,
+    /// Likewise.
+    SheenTint,
+    /// Likewise.
+    Clearcoat,
+    /// Likewise.
+    ClearcoatGloss,
+    /// Likewise.
+    Flatness,
 }
 
 /// A texture in the place of a parameter.
@@ -62,6 +82,15 @@ pub enum ReliefKind {
     Normals,
 }
 
+/// Two materials in the place of one. At each hit one of them is met, by the weight: in the mean that is the weighted sum of both.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Blend {
+    /// Probability of the second.
+    pub weight: Amount,
+    /// Indices into [`crate::world::World::materials`], below the material's own.
+    pub parts: [u32; 2],
+}
+
 /// What a material has beside its model.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Detail {
@@ -71,14 +100,17 @@ pub struct Detail {
     pub opacity: Amount,
     /// What turns the shading normal.
     pub relief: Option<Relief>,
-    /// Index into [`crate::world::World::materials`] of what the back side is made of, if it is something else.
+    /// Index into [`crate::world::World::materials`], below the material's own, of what the back side is made of, if it is something else.
     pub back: Option<u32>,
+    /// What is met in its place; its own model and relief are of no meaning then.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub blend: Option<Blend>,
 }
 
 impl Default for Detail {
     /// Nothing.
     fn default() -> Self {
-        Detail { textured: Vec::new(), opacity: Amount::Constant(1.0), relief: None, back: None }
+        Detail { textured: Vec::new(), opacity: Amount::Constant(1.0), relief: None, back: None, blend: None }
     }
 }
 
@@ -86,16 +118,23 @@ impl Detail {
     /// Whether it is textures in the place of parameters and nothing else.
     #[inline(always)]
     pub fn is_paint(&self) -> bool {
-        self.relief.is_none() && self.back.is_none() && self.opacity == Amount::Constant(1.0)
+        self.relief.is_none() && self.back.is_none() && self.blend.is_none() && self.opacity == Amount::Constant(1.0)
     }
 
     /// Every texture that it names.
     pub fn textures(&self) -> impl Iterator<Item = u32> {
-        let opacity = match self.opacity {
+        let of = |amount: Amount| match amount {
             Amount::Constant(_) => None,
             Amount::Texture(n) => Some(n),
         };
-        self.textured.iter().map(|t| t.texture).chain(opacity).chain(self.relief.map(|r| r.texture))
+        let weight = self.blend.and_then(|b| of(b.weight));
+        let own = self.textured.iter().map(|t| t.texture);
+        own.chain(of(self.opacity)).chain(self.relief.map(|r| r.texture)).chain(weight)
+    }
+
+    /// Every other material that it names.
+    pub fn materials(&self) -> impl Iterator<Item = u32> {
+        self.back.into_iter().chain(self.blend.into_iter().flat_map(|b| b.parts))
     }
 }
 
@@ -139,6 +178,11 @@ impl Material {
                         }
                     }
                 }
+                _ => {
+                    if let Some(place) = bsdf.number_mut(slot) {
+                        *place = share(texture.amount(tiles, uv));
+                    }
+                }
             }
         }
         bsdf
@@ -165,6 +209,9 @@ impl Bsdf {
     pub fn color_mut(&mut self, slot: Slot) -> Option<&mut [f32; 3]> {
         match (self, slot) {
             (Bsdf::Diffuse { reflectance: color }, Slot::Diffuse)
+            | (Bsdf::Phong { diffuse: color, .. }, Slot::Diffuse)
+            | (Bsdf::Phong { specular: color, .. }, Slot::Specular)
+            | (Bsdf::Principled(Principled { base_color: color, .. }), Slot::Diffuse)
             | (Bsdf::Plastic { diffuse: color, .. } | Bsdf::RoughPlastic { diffuse: color, .. }, Slot::Diffuse)
             | (Bsdf::Plastic { specular: color, .. } | Bsdf::RoughPlastic { specular: color, .. }, Slot::Specular)
             | (
@@ -185,6 +232,24 @@ impl Bsdf {
             ) => Some(color),
             _ => None,
         }
+    }
+
+    /// The number of a slot, where the model has it.
+    pub fn number_mut(&mut self, slot: Slot) -> Option<&mut f32> {
+        let Bsdf::Principled(p) = self else { return None };
+        Some(match slot {
+            Slot::Roughness => &mut p.roughness,
+            Slot::Anisotropic => &mut p.anisotropic,
+            Slot::Metallic => &mut p.metallic,
+            Slot::SpecTrans => &mut p.spec_trans,
+            Slot::SpecTint => &mut p.spec_tint,
+            Slot::Sheen => &mut p.sheen,
+            Slot::SheenTint => &mut p.sheen_tint,
+            Slot::Clearcoat => &mut p.clearcoat,
+            Slot::ClearcoatGloss => &mut p.clearcoat_gloss,
+            Slot::Flatness => &mut p.flatness,
+            _ => return None,
+        })
     }
 
     /// The roughness, where a texture may give it.

@@ -7,7 +7,9 @@ mod conductor;
 mod detail;
 mod dielectric;
 mod diffuse;
+mod phong;
 mod plastic;
+mod principled;
 mod rough;
 #[cfg(test)]
 mod tests;
@@ -15,10 +17,12 @@ mod tests;
 use glam::Vec3;
 use serde::{Deserialize, Serialize};
 
-pub use detail::{Amount, Detail, Relief, ReliefKind, Slot, Textured};
+pub use detail::{Amount, Blend, Detail, Relief, ReliefKind, Slot, Textured};
 pub use plastic::Transmittance;
+pub use principled::Principled;
 
 use dielectric::RoughInterface;
+use phong::Phong;
 use plastic::Coated;
 use rough::Rough;
 
@@ -122,6 +126,17 @@ pub enum Bsdf {
         /// Of this distribution, roughness and index.
         coat: Transmittance,
     },
+    /// A diffuse part and a lobe about the mirror's direction.
+    Phong {
+        /// Factor on the diffuse part.
+        diffuse: [f32; 3],
+        /// Factor on the lobe.
+        specular: [f32; 3],
+        /// Of the lobe's cosine, at least 0.
+        exponent: f32,
+    },
+    /// Mitsuba's model of many parameters.
+    Principled(Principled),
 }
 
 /// What a surface is made of.
@@ -199,7 +214,11 @@ impl Bsdf {
     /// Whether light passes through; then both sides of the surface count.
     #[inline(always)]
     pub fn transmits(&self) -> bool {
-        matches!(self, Bsdf::Dielectric { .. } | Bsdf::ThinDielectric { .. } | Bsdf::RoughDielectric { .. })
+        match self {
+            Bsdf::Dielectric { .. } | Bsdf::ThinDielectric { .. } | Bsdf::RoughDielectric { .. } => true,
+            Bsdf::Principled(p) => p.spec_trans > 0.0 && p.metallic < 1.0,
+            _ => false,
+        }
     }
 
     /// Whether the frame's tangents matter.
@@ -207,6 +226,7 @@ impl Bsdf {
     pub fn is_anisotropic(&self) -> bool {
         match self {
             Bsdf::RoughConductor { alpha, .. } | Bsdf::RoughDielectric { alpha, .. } => alpha[0] != alpha[1],
+            Bsdf::Principled(p) => p.anisotropic > 0.0,
             _ => false,
         }
     }
@@ -225,6 +245,8 @@ impl Bsdf {
             Bsdf::RoughPlastic { distribution, alpha, coat, .. } => self
                 .coated()
                 .map_or(Scatter::NONE, |c| c.eval_rough(&Rough::new(*distribution, [*alpha; 2]), coat, wo, wi)),
+            Bsdf::Phong { diffuse, specular, exponent } => Phong::new(*diffuse, *specular, *exponent).eval(wo, wi),
+            Bsdf::Principled(p) => p.eval(wo, wi, front),
         }
     }
 
@@ -250,6 +272,10 @@ impl Bsdf {
             Bsdf::RoughPlastic { distribution, alpha, coat, .. } => {
                 self.coated()?.sample_rough(&Rough::new(*distribution, [*alpha; 2]), coat, wo, u, lobe)
             }
+            Bsdf::Phong { diffuse, specular, exponent } => {
+                Phong::new(*diffuse, *specular, *exponent).sample(wo, u, lobe)
+            }
+            Bsdf::Principled(p) => p.sample(wo, front, u, lobe),
         }
     }
 

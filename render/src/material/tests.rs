@@ -48,13 +48,185 @@ fn all() -> Vec<(Bsdf, bool)> {
             out.push((rough_plastic(d, alpha, eta, diffuse, nonlinear), true));
         }
     }
+    for (diffuse, specular, exponent) in [(0.5, 0.2, 30.0), (0.0, 1.0, 4.0), (0.9, 0.6, 0.0), (0.3, 0.7, 100.0)] {
+        out.push((Bsdf::Phong { diffuse: [diffuse; 3], specular: [specular; 3], exponent }, true));
+    }
+    let metal = Principled { metallic: 1.0, roughness: 0.6, anisotropic: 0.5, base_color: [1.0; 3], ..PLAIN };
+    out.push((Bsdf::Principled(metal), true));
+    let glass = Principled { spec_trans: 1.0, roughness: 0.8, base_color: [1.0; 3], ..PLAIN };
+    out.push((Bsdf::Principled(glass), true));
+    out.push((Bsdf::Principled(glass), false));
     out
+}
+
+const PLAIN: Principled = Principled {
+    base_color: [0.5; 3],
+    eta: 1.5,
+    roughness: 0.7,
+    anisotropic: 0.0,
+    metallic: 0.0,
+    spec_trans: 0.0,
+    spec_tint: 0.0,
+    sheen: 0.0,
+    sheen_tint: 0.0,
+    clearcoat: 0.0,
+    clearcoat_gloss: 0.0,
+    flatness: 0.0,
+};
+
+/// Some of everything; lobes wide enough for the quadrature.
+fn any_principled(rng: &mut Rng) -> Principled {
+    let mut some = || if rng.u32() & 1 == 0 { 0.0 } else { rng.f32() };
+    let [metallic, spec_trans, spec_tint, sheen, sheen_tint, clearcoat, flatness, anisotropic] = [0; 8].map(|_| some());
+    Principled {
+        base_color: [rng.f32(), rng.f32(), rng.f32()],
+        eta: [1.5, 1.3, 2.0, 0.8][(rng.u32() % 4) as usize],
+        roughness: rng.range(0.6, 1.0),
+        anisotropic: 0.8 * anisotropic,
+        metallic,
+        spec_trans,
+        spec_tint,
+        sheen,
+        sheen_tint,
+        clearcoat,
+        clearcoat_gloss: 0.0,
+        flatness,
+    }
+}
+
+/// Principled with random parameters: samples follow the density, whose integral is what is not lost; directions may be exchanged.
+#[test]
+fn principled_in_any_mixture() {
+    let mut rng = Rng(17);
+    let (mut compared, mut exchanged) = (0, 0);
+    for i in 0..24 {
+        let p = any_principled(&mut rng);
+        let (bsdf, front) = (Bsdf::Principled(p), i % 4 != 0);
+        for wo in [local(0.4, 0.3), local(1.2, 2.0)] {
+            let (bins, n) = (20, 60_000);
+            let (mut counts, mut lost) = (vec![0.0; 2 * bins * bins], 0.0);
+            for _ in 0..n {
+                match bsdf.sample(wo, front, [rng.f32(), rng.f32()], rng.f32()) {
+                    Some(Sampled { wi, delta: None }) => {
+                        let wi = Vec3::from(UnitDir::encode(wi.to_array()).decode());
+                        counts[sphere_bin(wi, bins)] += 1.0;
+                    }
+                    _ => lost += 1.0,
+                }
+            }
+            // the coat's peak is as narrow as a degree
+            let midpoints = if p.clearcoat > 0.0 { 60 } else { 30 };
+            let mut expected = integrate_bins(bins, midpoints, |wi| f64::from(bsdf.eval(wo, wi, front).pdf));
+            let sum: f64 = expected.iter().sum();
+            let missing = 1.0 - lost / f64::from(n) - sum;
+            assert!(missing.abs() < 0.01, "{p:?} {front} {wo}: {sum}, lost {lost}");
+            if missing.abs() < 5e-4 && sum > 0.1 {
+                expected.iter_mut().for_each(|e| *e *= f64::from(n));
+                chi_square(&counts, &expected);
+                compared += 1;
+            }
+        }
+        for _ in 0..500 {
+            let mut up = || {
+                let d = rng.direction();
+                Vec3::new(d.x, d.y, d.z.abs().max(0.02)).normalize()
+            };
+            let (a, b) = (up(), up());
+            let (ab, ba) = (bsdf.eval(a, b, front).value.x / b.z, bsdf.eval(b, a, front).value.x / a.z);
+            assert!((ab - ba).abs() <= 1e-3 * ab.max(ba) + 1e-6, "{p:?} {a} {b}: {ab} {ba}");
+            exchanged += u32::from(ab > 0.0);
+        }
+    }
+    assert!(compared > 10 && exchanged > 6000, "{compared} {exchanged}");
+}
+
+/// Values that Mitsuba 3.9.1's `principled` (scalar_rgb) returned; the parameters are in the order of the fields.
+#[test]
+fn principled_is_mitsubas() {
+    for (params, wo, wi, expected) in MITSUBA {
+        let [r, g, b, eta, roughness, anisotropic, metallic, spec_trans, spec_tint, sheen, sheen_tint, ..] = *params;
+        let [.., clearcoat, clearcoat_gloss, flatness] = *params;
+        let p = Principled {
+            base_color: [r, g, b],
+            eta,
+            roughness,
+            anisotropic,
+            metallic,
+            spec_trans,
+            spec_tint,
+            sheen,
+            sheen_tint,
+            clearcoat,
+            clearcoat_gloss,
+            flatness,
+        };
+        let (wo, wi) = (Vec3::from(*wo).normalize(), Vec3::from(*wi).normalize());
+        // ours has z on the side of wo
+        let front = wo.z > 0.0;
+        let turn = |v: Vec3| if front { v } else { -v };
+        let s = Bsdf::Principled(p).eval(turn(wo), turn(wi), front);
+        let [x, y, z, pdf] = *expected;
+        let close = |found: f32, expected: f32| (found - expected).abs() <= 2e-3 * expected.abs() + 1e-6;
+        let all = close(s.value.x, x) && close(s.value.y, y) && close(s.value.z, z) && close(s.pdf, pdf);
+        assert!(all, "{p:?} {wo} {wi}: {s:?} instead of {expected:?}");
+    }
+}
+
+/// Parameters, view, direction, value and density.
+type PrincipledCase = ([f32; 14], [f32; 3], [f32; 3], [f32; 4]);
+#[rustfmt::skip]
+const MITSUBA: &[PrincipledCase] = &[
+    ([0.81, 0.81, 0.52, 1.8, 0.78, 0.0, 0.39, 0.0, 0.0, 0.06, 0.56, 0.0, 0.44, 0.06], [0.83, -1.64, 0.26], [-0.83, 1.64, 0.2], [0.127277, 0.127277, 0.113703, 0.364819]),
+    ([0.74, 0.5, 0.69, 0.8, 0.91, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.34, 0.41, 0.0], [0.03, -1.81, 0.42], [-0.51, 1.59, 0.79], [0.227061, 0.19733, 0.220867, 0.165391]),
+    ([0.04, 0.53, 0.48, 1.8, 0.33, 0.0, 0.67, 0.19, 0.99, 0.75, 0.96, 0.29, 0.22, 0.26], [-0.06, 1.85, 2.16], [-0.52, -0.93, 2.69], [0.0158946, 0.172682, 0.156683, 0.312482]),
+    ([0.19, 0.68, 0.5, 1.5, 0.47, 0.0, 0.18, 0.0, 0.0, 0.21, 0.0, 0.0, 0.0, 0.0], [1.72, 0.86, 0.33], [1.14, -0.14, 0.1], [0.00669677, 0.0231446, 0.0171025, 0.0223667]),
+    ([0.32, 0.63, 0.51, 1.8, 0.39, 0.06, 0.28, 0.23, 0.0, 0.54, 0.0, 0.03, 0.08, 0.0], [1.33, 0.35, 0.64], [-1.19, -0.33, 0.46], [1.61366, 2.15336, 1.94445, 3.86225]),
+    ([0.93, 0.23, 0.26, 1.8, 0.48, 0.67, 0.0, 0.65, 0.26, 0.0, 0.52, 0.07, 0.3, 0.0], [-0.33, 0.87, 1.33], [-0.17, 1.86, 0.04], [0.00276333, 0.000699879, 0.000788313, 0.00229385]),
+    ([0.33, 0.58, 0.58, 1.8, 0.61, 0.31, 0.56, 0.04, 0.29, 0.0, 0.0, 0.79, 0.0, 0.0], [-0.62, 0.43, -0.2], [-0.04, -2.49, -2.7], [0.00364383, 0.00364383, 0.00364383, 0.211343]),
+    ([0.09, 0.31, 0.49, 0.8, 0.7, 0.0, 0.79, 0.39, 0.0, 0.0, 0.04, 0.0, 0.1, 0.96], [-1.31, -0.37, 0.51], [0.21, -1.68, 1.27], [0.00806425, 0.0267033, 0.0419534, 0.0829047]),
+    ([0.15, 0.28, 0.74, 1.3, 0.76, 0.0, 0.99, 0.73, 0.0, 0.44, 0.87, 0.01, 0.1, 0.96], [-1.15, 0.34, 0.49], [0.94, -0.46, 0.7], [0.0640528, 0.107315, 0.260396, 0.402855]),
+    ([0.05, 0.1, 0.68, 1.3, 0.47, 0.0, 0.94, 0.0, 0.82, 0.08, 0.0, 0.15, 0.2, 0.0], [0.46, 0.36, 1.32], [-1.47, -1.6, 0.62], [0.00424658, 0.00799482, 0.0514745, 0.0851098]),
+    ([0.42, 0.46, 0.17, 1.3, 0.64, 0.0, 0.46, 0.0, 0.0, 0.0, 0.81, 0.45, 0.0, 0.35], [-1.65, 1.98, 0.25], [-0.06, -0.79, 0.94], [0.0992115, 0.108026, 0.0441237, 0.210486]),
+    ([0.5, 0.68, 0.02, 0.8, 0.35, 0.82, 0.76, 0.0, 0.0, 0.49, 0.81, 0.0, 0.0, 0.0], [0.37, 1.03, 1.64], [0.05, -0.2, 1.1], [0.0624687, 0.084885, 0.00269198, 0.113027]),
+    ([0.34, 0.49, 0.06, 0.8, 0.4, 0.0, 0.81, 0.26, 0.34, 0.04, 0.0, 0.0, 0.3, 0.0], [-0.62, -1.14, -2.37], [0.72, 0.92, -2.36], [0.00189832, 0.00189832, 0.00189832, 0.0384878]),
+    ([0.25, 0.46, 0.72, 0.8, 0.99, 0.1, 0.51, 0.08, 0.0, 0.34, 0.18, 0.0, 0.47, 0.22], [-1.54, 0.82, 0.18], [0.23, 2.45, 1.19], [0.0370634, 0.0675725, 0.105346, 0.12716]),
+    ([0.15, 0.89, 0.12, 0.8, 0.38, 0.0, 0.0, 0.33, 0.0, 0.24, 0.0, 0.0, 0.37, 0.77], [-0.61, 2.0, 0.66], [0.75, 1.22, 0.68], [0.0197308, 0.116608, 0.0158033, 0.0577353]),
+    ([0.55, 0.61, 0.34, 1.8, 0.32, 0.59, 0.0, 0.18, 0.0, 0.0, 0.0, 0.0, 0.0, 0.04], [-0.11, -0.11, -0.35], [-0.77, 0.64, 1.54], [0.00180157, 0.00189729, 0.00141647, 0.00417204]),
+    ([0.7, 0.47, 0.48, 1.8, 0.95, 0.0, 0.0, 0.23, 0.16, 0.58, 0.01, 0.0, 0.0, 0.59], [1.8, 0.51, 0.45], [-1.98, -0.72, 0.49], [0.110761, 0.0927332, 0.0935171, 0.112183]),
+    ([0.79, 0.38, 0.68, 1.5, 0.34, 0.84, 0.96, 0.0, 0.0, 0.94, 0.0, 0.34, 0.0, 0.45], [-1.07, -0.25, 0.43], [0.25, 1.1, 2.05], [0.060474, 0.029511, 0.0521669, 0.0742229]),
+    ([0.91, 0.14, 0.78, 1.5, 1.0, 0.0, 0.16, 0.0, 0.0, 0.47, 0.12, 0.46, 0.27, 0.0], [1.87, 1.0, 0.37], [0.02, -1.01, 0.24], [0.072909, 0.0153785, 0.0631961, 0.101767]),
+    ([0.9, 0.4, 0.2, 1.5, 0.69, 0.07, 0.0, 0.01, 0.05, 0.39, 0.18, 0.66, 0.0, 0.24], [0.4, 1.63, 0.93], [-1.04, -0.33, 0.18], [0.0539433, 0.0256359, 0.014313, 0.0535564]),
+    ([0.75, 0.4, 0.05, 1.8, 0.69, 0.0, 0.0, 0.28, 0.78, 0.0, 0.53, 0.0, 0.46, 0.0], [-0.31, -1.63, 1.57], [0.79, 1.71, 1.37], [0.150535, 0.0849135, 0.0192918, 0.256348]),
+    ([0.48, 0.83, 0.62, 1.8, 0.5, 0.65, 0.45, 0.0, 0.19, 0.0, 0.0, 0.91, 0.48, 0.78], [0.24, 0.62, 1.92], [1.18, -1.61, 1.18], [0.0602675, 0.101101, 0.0766009, 0.107165]),
+    ([0.17, 0.55, 0.86, 1.5, 0.78, 0.0, 0.54, 0.32, 0.9, 0.28, 0.46, 0.59, 0.0, 0.0], [-0.9, 1.7, 0.69], [-1.34, 1.85, 1.34], [0.0163008, 0.0520057, 0.0811334, 0.0793688]),
+    ([0.3, 0.1, 0.07, 0.8, 0.6, 0.8, 0.02, 0.17, 0.0, 0.71, 0.0, 0.0, 0.24, 0.01], [0.88, -0.79, 0.15], [0.96, 1.03, 0.23], [0.0239178, 0.0137366, 0.0122094, 0.208707]),
+    ([0.31, 0.19, 0.98, 0.8, 0.34, 0.0, 0.0, 0.51, 0.0, 0.0, 0.55, 0.0, 0.0, 0.79], [0.23, 0.16, -0.89], [-0.19, -0.3, -0.95], [0.0204994, 0.0204994, 0.0204994, 0.0402136]),
+    ([0.19, 0.26, 0.07, 1.5, 0.48, 0.47, 0.9, 0.0, 0.0, 0.0, 0.37, 0.7, 0.46, 0.0], [-0.14, 1.06, 0.3], [1.63, -1.03, 0.47], [0.00674721, 0.00876518, 0.00328784, 0.0338931]),
+    ([0.54, 0.92, 0.19, 1.8, 0.68, 0.0, 0.6, 0.0, 0.0, 0.0, 0.63, 0.87, 0.0, 0.14], [0.87, -1.44, 0.57], [0.99, 1.5, 0.15], [0.0115673, 0.0190847, 0.00464332, 0.0385564]),
+    ([0.09, 0.85, 0.44, 1.3, 0.91, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.76, 0.14, 0.89], [-0.45, -0.82, 0.14], [0.72, -0.94, 0.85], [0.0273449, 0.240761, 0.125629, 0.143135]),
+];
+
+/// The lobe of Phong's model holds what Lafortune and Willems say: seen straight from above, with the factor alone, all of it.
+#[test]
+fn phong_keeps_its_lobe() {
+    for exponent in [0.0, 1.0, 30.0, 100.0] {
+        let phong = Bsdf::Phong { diffuse: [0.0; 3], specular: [0.7; 3], exponent };
+        let albedo = |wo| integrate_bins(40, 30, |wi| f64::from(phong.eval(wo, wi, true).value.x)).iter().sum::<f64>();
+        let straight = albedo(Vec3::Z);
+        assert!((straight - 0.7).abs() < 0.003, "{exponent}: {straight}");
+        assert!(albedo(local(1.3, 0.4)) < straight + 0.003);
+    }
+    // both factors together beyond 1 are scaled down
+    let phong = Bsdf::Phong { diffuse: [0.9; 3], specular: [0.9; 3], exponent: 20.0 };
+    let albedo: f64 = integrate_bins(40, 30, |wi| f64::from(phong.eval(Vec3::Z, wi, true).value.x)).iter().sum();
+    assert!((albedo - 1.0).abs() < 0.003, "{albedo}");
 }
 
 /// What radiance is multiplied by when it leaves for `wi`, so that energy counts.
 fn crossing(bsdf: &Bsdf, front: bool, wi: Vec3) -> f32 {
     match bsdf {
         Bsdf::Dielectric { eta, .. } | Bsdf::RoughDielectric { eta, .. } if wi.z < 0.0 => relative(*eta, front).powi(2),
+        Bsdf::Principled(Principled { eta, .. }) if wi.z < 0.0 => relative(*eta, front).powi(2),
         _ => 1.0,
     }
 }
@@ -306,7 +478,29 @@ fn extremes_are_finite() {
         let eta_glass = [1.5, 1.0, 0.5, 1.000277, 10.0][(rng.u32() % 5) as usize];
         let white = [1.0; 3];
         let distribution = if i & 1 == 0 { Distribution::Beckmann } else { Distribution::Ggx };
-        let bsdf = match i % 8 {
+        let bsdf = match i % 10 {
+            8 => Bsdf::Phong {
+                diffuse: white,
+                specular: white,
+                exponent: [0.0, 1.0, 1e3, 1e6][(rng.u32() % 4) as usize],
+            },
+            9 => {
+                let mut end = || [0.0, 1.0, 0.5][(rng.u32() % 3) as usize];
+                Bsdf::Principled(Principled {
+                    base_color: [end(), end(), end()],
+                    eta: eta_glass,
+                    roughness: end(),
+                    anisotropic: end(),
+                    metallic: end(),
+                    spec_trans: end(),
+                    spec_tint: end(),
+                    sheen: end(),
+                    sheen_tint: end(),
+                    clearcoat: end(),
+                    clearcoat_gloss: end(),
+                    flatness: end(),
+                })
+            }
             0 => Bsdf::Diffuse { reflectance: [1.0; 3] },
             1 => Bsdf::Conductor { eta, k, specular: [1.0; 3] },
             2 => Bsdf::Dielectric { eta: eta_glass, reflect: white, transmit: white },

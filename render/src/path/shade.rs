@@ -6,7 +6,7 @@ use super::block::{Block, FlatDiffuse};
 use super::diffuse::{Fate, cosine_direction, onwards, snap, towards_light};
 use super::interaction::{Interaction, triangle_uv};
 use super::{Context, Contribution, Outcome, PathRay, ShadowRay, Surface, Surfaces, power_heuristic};
-use crate::material::{Bsdf, Detail, Material, Relief, ReliefKind};
+use crate::material::{Blend, Bsdf, Detail, Material, Relief, ReliefKind};
 use crate::math::{UnitDir, unit};
 use crate::ray::{Hit, PathKey, Ray};
 use crate::sampler::{BSDF, LIGHT, LIGHT_CHOICE, LOBE, ROULETTE, Stream};
@@ -245,13 +245,20 @@ pub(super) fn scatter_plain(
         out.counters.absorbed += 1;
         return;
     };
+    let next_key = PathKey { vertex: key.vertex + 1, ..key };
+    let numbers = Stream::new(frame.seed, key.pixel, key.sample).vertex(
+        u32::from(next_key.vertex),
+        frame.split,
+        u32::from(key.branch),
+    );
     let look;
-    let (bsdf, opacity) = match material.detail.as_deref() {
-        None => (&material.bsdf, 1.0),
-        Some(detail) => {
-            let opacity;
-            (look, opacity) = appearance(context, material, detail, surface, hit, d, &mut at);
-            (look.as_ref().unwrap_or(&material.bsdf), opacity)
+    let mut lobe = numbers[LOBE];
+    let (material, bsdf, opacity) = match material.detail.as_deref() {
+        None => (material, &material.bsdf, 1.0),
+        Some(_) => {
+            let (met, opacity);
+            (met, look, opacity) = appearance(context, material, surface, hit, d, &mut at, &mut lobe);
+            (met, look.as_ref().unwrap_or(&met.bsdf), opacity)
         }
     };
     // what is behind a surface of one side is black, but for what passes beside it
@@ -260,12 +267,6 @@ pub(super) fn scatter_plain(
         out.counters.absorbed += 1;
         return;
     }
-    let next_key = PathKey { vertex: key.vertex + 1, ..key };
-    let numbers = Stream::new(frame.seed, key.pixel, key.sample).vertex(
-        u32::from(next_key.vertex),
-        frame.split,
-        u32::from(key.branch),
-    );
     let origin = at.origin();
     let roulette = u32::from(next_key.vertex) >= frame.rr_depth;
     let direction = [unit(numbers[BSDF]), unit(numbers[BSDF + 1])];
@@ -322,7 +323,7 @@ pub(super) fn scatter_plain(
                 shadow(from, dir, light.tmax, throughput * value * light.radiance * weight, out);
             }
         }
-        let lobe = unit(numbers[LOBE]);
+        let lobe = unit(lobe);
         // at opacity 1 never, as the number is below 1
         let passes = lobe >= opacity;
         if !(passes || seen) {
@@ -378,28 +379,34 @@ pub(super) fn scatter_plain(
     }
 }
 
-/// What a material with detail looks like at a hit: its model (`None`: the material's own) and opacity. Turns the shading normal of `at`.
+/// What a material with detail is at a hit: which material is met, on this side and of those that are blended, its model (`None`: the material's
+/// own) and opacity. Turns the shading normal of `at`, and leaves in `number` what is as random after choosing.
 #[inline(never)]
-fn appearance(
-    context: &Context,
-    material: &Material,
-    detail: &Detail,
+fn appearance<'a>(
+    context: &Context<'a>,
+    material: &'a Material,
     surface: &Surface,
     hit: &Hit,
     d: Vec3,
     at: &mut Interaction,
-) -> (Option<Bsdf>, f32) {
+    number: &mut u32,
+) -> (&'a Material, Option<Bsdf>, f32) {
     let (world, tiles) = (context.world, context.textures);
     let uv = at.uv(surface, hit);
-    let opacity = detail.opacity.share(&world.textures, tiles, uv);
-    let back = if at.from_front { None } else { detail.back.map(|m| &world.materials[m as usize]) };
-    // of two materials each has its own textures and relief
-    let (material, inner) = match back {
-        Some(back) => (back, back.detail.as_deref()),
-        None => (material, Some(detail)),
+    let (mut material, mut opacity) = (material, 1.0);
+    // each names materials above itself, so this ends
+    let inner = loop {
+        let Some(detail) = material.detail.as_deref() else { break None };
+        opacity *= detail.opacity.share(&world.textures, tiles, uv);
+        let next = match (detail.back, detail.blend) {
+            (Some(back), _) if !at.from_front => back,
+            (_, Some(Blend { weight, parts })) => parts[choose(weight.share(&world.textures, tiles, uv), number)],
+            _ => break Some(detail),
+        };
+        material = &world.materials[next as usize];
     };
-    let relief = inner.and_then(|detail| detail.relief);
-    if let Some(Relief { kind, texture, mirrored }) = relief {
+    let Some(detail) = inner else { return (material, None, opacity) };
+    if let Some(Relief { kind, texture, mirrored }) = detail.relief {
         let texture = &world.textures[texture as usize];
         match kind {
             ReliefKind::Bump(scale) => {
@@ -411,11 +418,18 @@ fn appearance(
             }
         }
     }
-    let bsdf = match inner {
-        Some(detail) if !detail.textured.is_empty() => Some(material.at(detail, &world.textures, tiles, uv)),
-        _ => back.map(|back| back.bsdf.clone()),
-    };
-    (bsdf, opacity)
+    let textured = !detail.textured.is_empty();
+    (material, textured.then(|| material.at(detail, &world.textures, tiles, uv)), opacity)
+}
+
+/// 1 with probability `weight`, which is in [0, 1], else 0; what is left of the number is as random.
+#[inline]
+fn choose(weight: f32, number: &mut u32) -> usize {
+    const WHOLE: u64 = 1 << 32;
+    let (end, n) = ((f64::from(weight) * WHOLE as f64) as u64, u64::from(*number));
+    let (start, width, chosen) = if n < end { (0, end, 1) } else { (end, WHOLE - end, 0) };
+    *number = (((n - start) << 32) / width) as u32;
+    chosen
 }
 
 /// Whether a direction of cosine `geometric` to the geometric normal and `shading` to the shading normal leaves on one side by both; on the far side

@@ -6,7 +6,7 @@ use super::mean_of;
 use crate::film::FilmPart;
 use crate::frame::Frame;
 use crate::light::Lights;
-use crate::material::{Amount, Bsdf, Detail, Relief, ReliefKind};
+use crate::material::{Amount, Blend, Bsdf, Detail, Relief, ReliefKind};
 use crate::path::{Context, reference};
 use crate::texture::{Checkerboard, Texture, UvMap};
 
@@ -110,6 +110,61 @@ fn one_side_with_holes() {
     let behind = mean_of(&scene, &frame([0.0, 0.0, -4.0], 20.0, [8, 8], 6), 1024);
     for (found, expected) in [(front, 0.25 * 0.8 + 0.75), (behind, 0.75)] {
         assert!((found - expected).abs() < 0.006, "{found} instead of {expected}");
+    }
+}
+
+/// Albedos 0.8 and 0.2 blended are their weighted mean, under splitting too; a part may be a blend itself, or nothing at all.
+#[test]
+fn blends_are_weighted_means() {
+    for (case, expected) in
+        [(0, 0.3 * 0.2 + 0.7 * 0.8), (1, 0.2 * 0.2 + 0.8 * 0.8), (2, 0.5 * 0.6 + 0.5 * 0.5), (3, 0.3 + 0.7 * 0.8)]
+    {
+        for split in [1, 3] {
+            let mut scene = Scene { environment: Some([1.0; 3]), ..Scene::default() };
+            let (bright, dark) = (scene.diffuse(0.8), scene.diffuse(0.2));
+            let black = Bsdf::Diffuse { reflectance: [0.0; 3] };
+            let blend = |scene: &mut Scene, weight, parts| {
+                let detail = Detail { blend: Some(Blend { weight, parts }), ..Detail::default() };
+                scene.detailed(black.clone(), detail)
+            };
+            let material = match case {
+                0 => blend(&mut scene, Amount::Constant(0.3), [bright, dark]),
+                1 => {
+                    // 51 / 255 is a fifth
+                    let weight = Amount::Texture(scene.image([1, 1], vec![51; 3]));
+                    blend(&mut scene, weight, [bright, dark])
+                }
+                2 => {
+                    let half = scene.diffuse(0.5);
+                    // 0.6 = 0.8 2/3 + 0.2 1/3
+                    let inner = blend(&mut scene, Amount::Constant(1.0 / 3.0), [bright, dark]);
+                    blend(&mut scene, Amount::Constant(0.5), [inner, half])
+                }
+                _ => {
+                    let null = Detail { opacity: Amount::Constant(0.0), ..Detail::default() };
+                    let null = scene.detailed(black.clone(), null);
+                    blend(&mut scene, Amount::Constant(0.3), [bright, null])
+                }
+            };
+            let shape = scene.shape(material, None);
+            scene.quad(shape, [-50.0, -50.0, 3.0], [100.0, 0.0, 0.0], [0.0, 100.0, 0.0]);
+            let frame = Frame { split, ..frame([0.0, 0.0, -2.0], 30.0, [8, 8], 8) };
+            let found = mean_of(&scene, &frame, 1024);
+            assert!((found - expected).abs() < 0.004, "{case} {split}: {found} instead of {expected}");
+        }
+    }
+}
+
+/// A material that is part of itself is refused.
+#[test]
+fn blends_without_end_are_refused() {
+    let mut scene = Scene::default();
+    let a = scene.diffuse(0.5);
+    for parts in [[a, a + 1], [a + 1, a], [a, a + 2]] {
+        let mut scene = Scene { materials: scene.materials.clone(), ..Scene::default() };
+        let blend = Some(Blend { weight: Amount::Constant(0.5), parts });
+        scene.detailed(Bsdf::Diffuse { reflectance: [0.0; 3] }, Detail { blend, ..Detail::default() });
+        assert!(scene.world().check().unwrap_err().contains("not above it"));
     }
 }
 

@@ -19,7 +19,7 @@ impl Converter<'_> {
             return Ok(n);
         }
         let mut material = self.bsdf(id, from)?;
-        material.name = self.document.objects[id].id.clone().unwrap_or_else(|| bsdf_name(&material.bsdf).into());
+        material.name = self.document.objects[id].id.clone().unwrap_or_else(|| bsdf_name(&material).into());
         let n = self.push_material(material);
         self.materials.insert(id, n);
         Ok(n)
@@ -36,13 +36,13 @@ impl Converter<'_> {
         }
     }
 
-    fn push_material(&mut self, material: Material) -> u32 {
+    pub(super) fn push_material(&mut self, material: Material) -> u32 {
         self.out.materials.push(material);
         self.out.materials.len() as u32 - 1
     }
 
     /// A material without a name.
-    fn bsdf(&mut self, id: ObjectId, from: &Place) -> Result<Material, ImportError> {
+    pub(super) fn bsdf(&mut self, id: ObjectId, from: &Place) -> Result<Material, ImportError> {
         self.enter(id, from)?;
         let object = &self.document.objects[id];
         let place = &object.place;
@@ -81,10 +81,19 @@ impl Converter<'_> {
                 one_sided(self.transparent(id, plugin, &mut textured)?)
             }
             plugin @ ("plastic" | "roughplastic") => one_sided(self.plastic(id, plugin, &mut textured)?),
-            plugin @ ("roughdiffuse" | "phong" | "ward" | "principled") => {
+            "phong" => one_sided(self.phong(id, &mut textured)?),
+            "principled" => one_sided(self.principled(id, &mut textured)?),
+            "blendbsdf" => self.blend(id)?,
+            // light passes as through a mask of opacity 0
+            "null" => {
+                let mut material = one_sided(Bsdf::Diffuse { reflectance: [0.0; 3] });
+                detail_of(&mut material).opacity = Amount::Constant(0.0);
+                material
+            }
+            plugin @ ("roughdiffuse" | "ward") => {
                 self.unsupported(place, format!("bsdf \"{plugin}\""), "diffuse of its diffuse colour, two-sided");
                 let mut reflectance = None;
-                for name in ["diffuse_reflectance", "reflectance", "base_color"] {
+                for name in ["diffuse_reflectance", "reflectance"] {
                     if reflectance.is_none() {
                         reflectance = self.paint(id, name, Slot::Diffuse, &mut textured)?;
                     }
@@ -114,16 +123,13 @@ impl Converter<'_> {
             [(p, front), (q, back)] => (self.bsdf(front, &p.place)?, Some((back, q))),
             _ => return malformed(place, "twosided needs one or two materials inside"),
         };
-        front.two_sided = true;
-        mirror_relief(&mut front);
+        self.spread(&mut front, &mirror);
         if let Some((back, q)) = back {
             let mut behind = self.bsdf(back, &q.place)?;
-            behind.two_sided = true;
-            behind.name = self.document.objects[back].id.clone().unwrap_or_else(|| bsdf_name(&behind.bsdf).into());
-            mirror_relief(&mut behind);
-            let nests = |m: &Material| m.detail.as_ref().is_some_and(|d| d.back.is_some());
-            let passes = |m: &Material| m.detail.as_ref().is_some_and(|d| d.opacity != Amount::Constant(1.0));
-            if nests(&front) || nests(&behind) || passes(&front) || passes(&behind) {
+            behind.name = self.document.objects[back].id.clone().unwrap_or_else(|| bsdf_name(&behind).into());
+            self.spread(&mut behind, &mirror);
+            let nests = |d: &Detail| d.back.is_some() || d.opacity != Amount::Constant(1.0);
+            if self.has(&front, &nests) || self.has(&behind, &nests) {
                 return malformed(place, "twosided with two materials takes no mask and no twosided inside");
             }
             let back = self.push_material(behind);
@@ -194,17 +200,32 @@ impl Converter<'_> {
         };
         let Some(texture) = texture else { return Ok(inner) };
         let relief = Relief { kind, texture, mirrored: false };
-        let back = inner.detail.as_ref().and_then(|d| d.back);
-        let twice = |m: &Material| m.detail.as_ref().is_some_and(|d| d.relief.is_some());
-        if twice(&inner) || back.is_some_and(|n| twice(&self.out.materials[n as usize])) {
+        if self.has(&inner, &|d| d.relief.is_some()) {
             self.unsupported(place, format!("{plugin} around another relief"), "the inner relief");
             return Ok(inner);
         }
-        detail_of(&mut inner).relief = Some(relief);
-        if let Some(n) = back {
-            detail_of(&mut self.out.materials[n as usize]).relief = Some(relief);
-        }
+        self.spread(&mut inner, &|m| detail_of(m).relief = Some(relief));
         Ok(inner)
+    }
+
+    /// Changes a material, or what it is blended of, and what is on its back.
+    fn spread(&mut self, material: &mut Material, change: &dyn Fn(&mut Material)) {
+        let below: Vec<u32> = material.detail.iter().flat_map(|d| d.materials()).collect();
+        if material.detail.as_ref().is_none_or(|d| d.blend.is_none()) {
+            change(material);
+        }
+        for n in below {
+            let mut part = self.out.materials[n as usize].clone();
+            self.spread(&mut part, change);
+            self.out.materials[n as usize] = part;
+        }
+    }
+
+    /// Whether a material, or what it is made of, has a detail of a kind.
+    fn has(&self, material: &Material, kind: &dyn Fn(&Detail) -> bool) -> bool {
+        material.detail.as_ref().is_some_and(|detail| {
+            kind(detail) || detail.materials().any(|n| self.has(&self.out.materials[n as usize], kind))
+        })
     }
 
     /// The one material inside an adapter.
@@ -315,19 +336,23 @@ impl Converter<'_> {
 }
 
 /// The detail of a material, which gets one.
-fn detail_of(material: &mut Material) -> &mut Detail {
+pub(super) fn detail_of(material: &mut Material) -> &mut Detail {
     material.detail.get_or_insert_default()
 }
 
-/// A relief inside of `twosided` is seen from behind as from the front.
-fn mirror_relief(material: &mut Material) {
+/// Inside of `twosided` the back is as the front, its relief too.
+fn mirror(material: &mut Material) {
+    material.two_sided = true;
     if let Some(relief) = material.detail.as_mut().and_then(|d| d.relief.as_mut()) {
         relief.mirrored = true;
     }
 }
 
-fn bsdf_name(bsdf: &Bsdf) -> &'static str {
-    match bsdf {
+pub(super) fn bsdf_name(material: &Material) -> &'static str {
+    if material.detail.as_ref().is_some_and(|d| d.blend.is_some()) {
+        return "blendbsdf";
+    }
+    match material.bsdf {
         Bsdf::Diffuse { .. } => "diffuse",
         Bsdf::Conductor { .. } => "conductor",
         Bsdf::RoughConductor { .. } => "roughconductor",
@@ -336,5 +361,7 @@ fn bsdf_name(bsdf: &Bsdf) -> &'static str {
         Bsdf::RoughDielectric { .. } => "roughdielectric",
         Bsdf::Plastic { .. } => "plastic",
         Bsdf::RoughPlastic { .. } => "roughplastic",
+        Bsdf::Phong { .. } => "phong",
+        Bsdf::Principled(_) => "principled",
     }
 }

@@ -16,6 +16,7 @@
 
 mod bsdf;
 mod coats;
+mod composed;
 mod daylight;
 mod emitter;
 mod scene;
@@ -233,6 +234,8 @@ fn shorten(text: &str) -> String {
     if text.chars().count() <= 40 { text.into() } else { text.chars().take(40).chain("...".chars()).collect() }
 }
 
+#[cfg(test)]
+mod composed_tests;
 #[cfg(test)]
 mod daylight_tests;
 #[cfg(test)]
