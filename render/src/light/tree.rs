@@ -176,6 +176,7 @@ impl Node {
 
     /// What may arrive at `o` on a surface that faces it, roughly; 0 only if nothing does.
     #[inline]
+    #[expect(clippy::manual_clamp, reason = "clamp leaves NaN as it is")]
     fn importance(&self, o: Vec3) -> f32 {
         let to = o - self.center;
         let d2 = to.length_squared();

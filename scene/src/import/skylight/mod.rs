@@ -127,7 +127,7 @@ pub(super) fn picture(sky: &Skylight) -> SkyMap {
 
 /// Irradiance, in Mitsuba's units, of the sun on a surface that faces it; 0 below the horizon. `height` is the sine of its elevation.
 pub(super) fn sun_irradiance(turbidity: f64, height: f64) -> [f64; 3] {
-    if !(height >= 0.0) {
+    if height.is_nan() || height < 0.0 {
         return [0.0; 3];
     }
     let elevation = (FRAC_PI_2 - libm::acos(height.min(1.0))).to_degrees();
