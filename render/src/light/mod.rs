@@ -1,7 +1,7 @@
 //! Light sources: choosing one, a point on it, and the density with which that happens.
 //!
 //! A source is a primitive that emits, a [beam](crate::world::Beam), or the sky. Sky and parallel light have shares that do not depend on
-//! where they are seen from; so has what is local where it is but one shape of at most [`FEW`] triangles or one sphere. Of more, a [tree]
+//! where they are seen from; so has what is local where it is one shape, or where all there is are at most [`FEW`] triangles. Of more, a [tree]
 //! chooses by the point that is lit. Nine tenths of the shares of shapes and beams go by power (luminance x area x pi), one tenth is dealt
 //! evenly; a primitive of a shape has its share of the area. The probabilities are multiples of 2^-32, intervals of integers, so one 32-bit
 //! number chooses exactly by them and both sides of MIS see the same ones.
@@ -121,17 +121,24 @@ impl Lights {
 
     /// Tables for a world and the picture of its sky, which is dark where the world wants one and there is none.
     pub fn with_sky_map(world: &World, map: Option<Arc<SkyMap>>) -> Lights {
-        Lights::build(world, map, |sources, shapes| sources.len() > 1 && (shapes > 1 || sources.len() > FEW))
+        // of a few triangles the choice is vector code, and by power: the tree has a fifth less variance there, and takes a third longer
+        Lights::build(world, map, |sources, parts, few| sources > 1 && !few && (parts > 1 || sources > FEW))
     }
 
     /// The plain twin: a choice by power alone.
     #[cfg(test)]
     pub(crate) fn by_power(world: &World, map: Option<Arc<SkyMap>>) -> Lights {
-        Lights::build(world, map, |_, _| false)
+        Lights::build(world, map, |_, _, _| false)
     }
 
-    /// `wants_tree` is told the local sources, and of how many shapes and beams they are.
-    fn build(world: &World, map: Option<Arc<SkyMap>>, wants_tree: impl Fn(&[Bounds], usize) -> bool) -> Lights {
+    /// With a tree whatever the sources.
+    #[cfg(test)]
+    pub(crate) fn by_tree(world: &World) -> Lights {
+        Lights::build(world, None, |sources, _, _| sources > 0)
+    }
+
+    /// `wants_tree` is told the number of local sources, of how many shapes and beams they are, and whether all there is are a few triangles.
+    fn build(world: &World, map: Option<Arc<SkyMap>>, wants_tree: impl Fn(usize, usize, bool) -> bool) -> Lights {
         let mut sources = Vec::new();
         let mut by_prim = Vec::new();
         let mut areas = vec![0.0f64; world.shapes.len()];
@@ -182,7 +189,9 @@ impl Lights {
         let bounds: Vec<Bounds> = sources.iter().map_while(Bounds::new).collect();
         let (mut tree, mut in_tree) = (None, 0);
         let mut ends = Vec::new();
-        if wants_tree(&bounds, parts) {
+        let only_triangles = !sources.is_empty() && sources.iter().all(|s| matches!(s.geometry, Geometry::Triangle(_)));
+        let is_few = only_triangles && sources.len() <= FEW;
+        if wants_tree(bounds.len(), parts, is_few) {
             in_tree = bounds.len();
             // the tree as one weight, before those that are not in it
             let local: f64 = weights[..in_tree].iter().sum();
@@ -198,9 +207,7 @@ impl Lights {
             start = end;
         }
         let sky_probability = sky.mean().map_or(0.0, |_| sources.last().map_or(0.0, |s| s.probability));
-        let only_triangles = !sources.is_empty() && sources.iter().all(|s| matches!(s.geometry, Geometry::Triangle(_)));
-        let is_few = tree.is_none() && only_triangles && sources.len() <= FEW;
-        let few = if is_few { few_triangles(&sources, &ends) } else { Vec::new() };
+        let few = if tree.is_none() && is_few { few_triangles(&sources, &ends) } else { Vec::new() };
         Lights { sources, tree, ends, in_tree, by_prim, sky, sky_probability, only_triangles, few }
     }
 

@@ -73,7 +73,7 @@ fn intervals_are_exact_and_leave_out_only_the_dark() {
     for n in [2, 3, 10, 100, 1000] {
         let world =
             World { environment: [None, Some(Environment::Constant([0.5; 3]))][n % 2].clone(), ..motley(n, &mut rng) };
-        let lights = Lights::new(&world);
+        let lights = Lights::by_tree(&world);
         let share = lights.tree.as_ref().map_or(0, Tree::share);
         assert_eq!(share == ALL, n % 2 == 0, "the sky has the rest");
         let most = 200_000 / n.max(100);
@@ -165,7 +165,7 @@ fn the_mean_is_that_by_power_and_the_variance_less() {
     assert!(beyond <= 2 && gain.exp() > 1.8, "{beyond} {}", gain.exp());
 }
 
-/// A room's lamp of two triangles, or one sphere, is chosen from as ever; a second lamp makes a tree.
+/// One sphere, or lamps of eight triangles in all, are chosen from as ever; more make a tree.
 #[test]
 fn one_lamp_needs_no_tree() {
     let quad = [
@@ -178,6 +178,10 @@ fn one_lamp_needs_no_tree() {
     assert!(Lights::new(&world(&[ball], &[1.0], Some([1.0; 3]))).tree.is_none());
     let two = Lights::new(&world(&[quad[0], quad[1], (ball.0, 1)], &[1.0, 1.0], None));
     assert!(two.tree.is_some() && two.few_triangles().is_none());
+    let pair = |n: u32| [(quad[0].0, n), (quad[1].0, n)];
+    let four: Vec<_> = (0..4).flat_map(pair).collect();
+    assert!(Lights::new(&world(&four, &[1.0; 4], None)).few_triangles().is_some());
+    assert!(Lights::new(&world(&[four, pair(4).to_vec()].concat(), &[1.0; 5], None)).tree.is_some());
 }
 
 /// Lights in one place, on a line, of powers from 1e-30 to 1e30, and points that are none: every choice is a source with a probability.
