@@ -33,6 +33,11 @@ fn scenes_grow_and_lose_their_order() {
     refused(&["subdivide", "t.obj", "-o", "none/x.ply"], &["none/x.ply"]);
     refused(&["replicate", "t.obj", "-o", "x.ply", "--copies", "2,2", "--step", "1,1,1"], &["--copies", "three"]);
     refused(&["interleave", "t.obj", "-o", "x.ply", "--strands", "0"], &["1 to 4096"]);
+    refused(&["many-lights", "0", "-o", "x.xml"], &["1..=100000"]);
+    let said = tool(&["many-lights", "120", "-o", "room.xml"]);
+    assert!(said.starts_with("room.xml: 120 lamps"), "{said}");
+    let room = rayherd(folder.path(), &["render", "room.xml", "--size", "8x8", "--spp", "2"]);
+    assert!(room.code == 0 && room.out.contains("room.exr"), "{}{}", room.out, room.err);
     // found before anything is written: this would be 1.2 TB
     let many = ["replicate", "t.obj", "-o", "x.ply", "--copies", "1000000,1000,1", "--step", "1,1,1"];
     refused(&many, &["12000000000 vertices", "fewer levels or copies"]);

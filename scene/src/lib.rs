@@ -6,6 +6,7 @@ pub mod image;
 pub mod import;
 pub mod inspect;
 pub mod manifest;
+pub mod many_lights;
 pub mod objects;
 pub mod overlap;
 pub mod prepare;

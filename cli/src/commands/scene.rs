@@ -5,6 +5,7 @@ use std::process::ExitCode;
 
 use clap::{Args, Subcommand};
 use rayherd_scene::import::{DescriptionSource, ImportOptions, StreamOptions, import_surface};
+use rayherd_scene::many_lights::{MOST_LAMPS, many_lights};
 use rayherd_scene::prepare::source_files;
 use rayherd_scene::record::RecordSource;
 use rayherd_scene::tools::{self, ToolError, Written};
@@ -13,11 +14,12 @@ use super::{print, size};
 use crate::options::numbers;
 use crate::output::{distinct, replace};
 
-/// Make a larger or worse-ordered scene out of one, as binary PLY: triangles only
+/// Make a larger or worse-ordered scene out of one, as binary PLY (triangles only), or a room to measure with
 #[derive(Args)]
 #[command(after_help = "Examples:\n  rayherd scene subdivide bunny.ply -o big.ply --levels 2\n  \
     rayherd scene replicate bunny.ply -o many.ply --copies 4,4,1 --step 0.2,0.2,0\n  \
-    rayherd scene interleave many.ply -o mixed.ply --strands 32")]
+    rayherd scene interleave many.ply -o mixed.ply --strands 32\n  \
+    rayherd scene many-lights 1000 -o room.xml")]
 pub struct Arguments {
     #[command(subcommand)]
     tool: Tool,
@@ -55,6 +57,18 @@ enum Tool {
         #[arg(long, value_name = "N")]
         strands: u32,
     },
+    /// A room under so many small lamps, as Mitsuba XML; the same every time
+    #[command(
+        after_help = "Example:\n  rayherd scene many-lights 1000 -o room.xml && rayherd render room.xml --spp 16"
+    )]
+    ManyLights {
+        /// Number of lamps, at most 100000
+        #[arg(value_parser = clap::value_parser!(u32).range(1..=i64::from(MOST_LAMPS)))]
+        lamps: u32,
+        /// The XML to write
+        #[arg(short, long, value_name = "XML")]
+        output: PathBuf,
+    },
 }
 
 #[derive(Args)]
@@ -75,6 +89,13 @@ pub fn run(arguments: &Arguments) -> anyhow::Result<ExitCode> {
         Tool::Subdivide { files, levels } => (files, write(files, |s, out| tools::subdivide(s, *levels, out))?),
         Tool::Replicate { files, copies, step } => {
             (files, write(files, |s, out| tools::replicate(s, *copies, *step, out))?)
+        }
+        Tool::ManyLights { lamps, output } => {
+            replace::probe(output, "-o")?;
+            let text = many_lights(*lamps);
+            replace::replace_or_keep(output, text.as_bytes())?;
+            print(&format!("{}: {lamps} lamps, {}\n", output.display(), size(text.len() as u64)))?;
+            return Ok(ExitCode::SUCCESS);
         }
         Tool::Interleave { files, strands } => (files, write(files, |s, out| tools::interleave(s, *strands, out))?),
     };

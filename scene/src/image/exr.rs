@@ -18,6 +18,10 @@ fn header_of(meta: &MetaData, length: u64) -> Result<(Header, Vec<String>), Stri
         // its decoder panics on some damaged files
         return Err("is compressed by B44, which is not read: save it with ZIP".into());
     }
+    if matches!(first.compression, Compression::DWAA(_) | Compression::DWAB(_)) {
+        // its decoder takes powers and cosines from the system's library, which differ by system
+        return Err("is compressed by DWA, which is not read: save it with ZIP".into());
+    }
     let has = |name: &str| first.channels.list.iter().any(|c| c.name.to_string() == name);
     let names: Vec<String> = if ["R", "G", "B"].into_iter().all(has) {
         ["R", "G", "B"].map(str::to_owned).to_vec()
