@@ -229,12 +229,19 @@ fn render(
     let outcome = render_local(scene, &shot.frame, sampling, settings, &display);
     drop(heeding);
     display.finish();
-    outcome.with_context(|| match (interrupt::requested(), &settings.commits) {
-        (true, Some(_)) => {
-            format!("{} is not finished: its committed samples are kept, go on with --resume", shot.exr.display())
-        }
-        (true, None) => format!("{} is not finished; with --store it could be resumed", shot.exr.display()),
-        (false, _) => format!("cannot render {}", shot.exr.display()),
+    let kept = settings.commits.is_some();
+    outcome.map_err(|error| {
+        let exr = shot.exr.display();
+        let what = match (interrupt::requested(), kept) {
+            (true, true) => format!("{exr} is not finished: its committed samples are kept, go on with --resume"),
+            (true, false) => format!("{exr} is not finished; with --store it could be resumed"),
+            // a full store, a server that is gone
+            (false, true) if !error.is_users() => {
+                format!("cannot render {exr} (what is committed is kept: when that is mended, go on with --resume)")
+            }
+            (false, _) => format!("cannot render {exr}"),
+        };
+        anyhow::Error::new(error).context(what)
     })
 }
 
