@@ -4,11 +4,11 @@ use anyhow::Context;
 use clap::Args;
 use k8s_openapi::api::core::v1::Pod;
 use k8s_openapi::jiff::Timestamp;
-use kube::api::{ListParams, LogParams, Patch, PatchParams};
+use kube::api::{ApiResource, DynamicObject, ListParams, LogParams, Patch, PatchParams};
 use kube::config::{KubeConfigOptions, Kubeconfig};
 use kube::{Api, Client, Config, ResourceExt};
 use rayherd_api::RenderJob;
-use rayherd_api::resource::RenderJobObject;
+use rayherd_api::resource::{RenderJobObject, RenderJobStatus};
 use rustls::crypto::ring::default_provider;
 use tokio::runtime::Runtime;
 
@@ -88,8 +88,9 @@ impl Cluster {
         Ok(Cluster { client, namespace, runtime })
     }
 
-    fn api(&self) -> Api<RenderJobObject> {
-        Api::namespaced(self.client.clone(), &self.namespace)
+    /// As the API server has them: one whose spec nobody can read must not hide the others.
+    fn api(&self) -> Api<DynamicObject> {
+        Api::namespaced_with(self.client.clone(), &self.namespace, &kind())
     }
 
     /// The namespace that is worked in.
@@ -122,7 +123,7 @@ impl Cluster {
     /// # Errors
     /// When the API server does not list them.
     pub fn jobs(&self, everywhere: bool) -> anyhow::Result<Vec<Shown>> {
-        let api: Api<RenderJobObject> = if everywhere { Api::all(self.client.clone()) } else { self.api() };
+        let api = if everywhere { Api::all_with(self.client.clone(), &kind()) } else { self.api() };
         let listed = self.runtime.block_on(api.list(&ListParams::default()));
         let mut jobs: Vec<Shown> = listed.map_err(|e| self.told(e, "renderjobs"))?.iter().map(shown).collect();
         jobs.sort_by(|a, b| (&a.namespace, &a.name).cmp(&(&b.namespace, &b.name)));
@@ -172,8 +173,13 @@ impl Cluster {
     }
 }
 
-fn shown(job: &RenderJobObject) -> Shown {
-    let status = job.status.clone().unwrap_or_default();
+fn kind() -> ApiResource {
+    ApiResource::erase::<RenderJobObject>(&())
+}
+
+fn shown(job: &DynamicObject) -> Shown {
+    // one of another version says nothing
+    let status: RenderJobStatus = serde_json::from_value(job.data["status"].clone()).unwrap_or_default();
     let current = status.observed_generation == job.metadata.generation;
     let failed = status.conditions.iter().find(|c| c.type_ == "Failed" && c.status == "True" && current);
     let age = job.metadata.creation_timestamp.as_ref();
@@ -206,12 +212,12 @@ mod tests {
 
     #[test]
     fn a_job_is_shown_as_its_spec_stands_now() {
-        let job = |observed: i64| -> RenderJobObject {
+        let job = |observed: i64| -> DynamicObject {
             serde_json::from_value(serde_json::json!({
                 "apiVersion": "rayherd.io/v1alpha1",
                 "kind": "RenderJob",
                 "metadata": {"name": "box", "namespace": "studio", "generation": 2},
-                "spec": {"scene": {"source": "a/b.xml"}},
+                "spec": {"scene": {"source": "a/b.xml"}, "workers": {"memory": "99999999999E"}},
                 "status": {"phase": "Failed", "observedGeneration": observed, "progress": "40%", "conditions": [{
                     "type": "Failed", "status": "True", "reason": "CannotRender", "message": "no",
                     "lastTransitionTime": "2026-01-01T00:00:00Z",
