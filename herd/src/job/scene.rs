@@ -115,7 +115,8 @@ impl PreparedScene {
     pub fn image_name(&self, frame: &Frame) -> Result<String, JobError> {
         let frame = serde_json::to_vec(frame).map_err(|e| JobError::Internal(e.to_string()))?;
         let mut hasher = blake3::Hasher::new();
-        hasher.update(b"rayherd image 1\0").update(&self.manifest.content.0).update(&frame);
+        // the number changes whenever another picture is made of the same scene and frame: no run goes on with another program's film
+        hasher.update(b"rayherd image 2\0").update(&self.manifest.content.0).update(&frame);
         Ok(hasher.finalize().to_hex().to_string())
     }
     /// What every path of a frame shares, but for textures.
