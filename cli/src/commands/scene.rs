@@ -14,7 +14,7 @@ use super::{print, size};
 use crate::options::numbers;
 use crate::output::{distinct, replace};
 
-/// Make a larger or worse-ordered scene out of one, as binary PLY (triangles only), or a room to measure with
+/// Make a larger or worse-ordered scene out of one, or a room to measure with
 #[derive(Args)]
 #[command(after_help = "Examples:\n  rayherd scene subdivide bunny.ply -o big.ply --levels 2\n  \
     rayherd scene replicate bunny.ply -o many.ply --copies 4,4,1 --step 0.2,0.2,0\n  \
