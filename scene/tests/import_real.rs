@@ -78,7 +78,7 @@ fn dining_room() {
 
 #[test]
 fn classroom() {
-    scene("scene-classroom", true, (103_832, 0));
+    scene("scene-classroom", false, (103_832, 0));
 }
 
 #[test]
