@@ -1,6 +1,7 @@
 """Median over interleaved pairs of our rays per second over the prototype's and Embree's (fast mode), with its 95 % interval."""
 import argparse
 import re
+import statistics
 import subprocess
 import sys
 from pathlib import Path
@@ -63,7 +64,7 @@ def main() -> None:
             print(f"{size} pair {pair}: " + ", ".join(f"{s} {mine[s]:.2f} / {proto[s]:.2f} / {embree[s]:.2f}" for s in SETS), flush=True)
         for (s, peer), ratios in over.items():
             lo, hi = interval(ratios)
-            print(f"{size} {s} over {peer}: median {sorted(ratios)[len(ratios) // 2]:.3f}, 95 % interval {lo:.3f} to {hi:.3f}", flush=True)
+            print(f"{size} {s} over {peer}: median {statistics.median(ratios):.3f}, 95 % interval {lo:.3f} to {hi:.3f}", flush=True)
 
 
 if __name__ == "__main__":

@@ -25,7 +25,8 @@ pub fn process_cpu() -> anyhow::Result<f64> {
 /// The middle of some figures.
 pub fn median(mut figures: Vec<f64>) -> f64 {
     figures.sort_by(f64::total_cmp);
-    figures[figures.len() / 2]
+    let n = figures.len();
+    0.5 * (figures[(n - 1) / 2] + figures[n / 2])
 }
 
 /// Order statistics that hold the median of what was measured with at least 95 % (binomial), as far as there are enough figures.
