@@ -3,7 +3,8 @@
 //! A source is a primitive that emits, a [beam](crate::world::Beam), or the sky. Sky and parallel light have shares that do not depend on
 //! where they are seen from; so has what is local where it is one shape, or where all there is are at most [`FEW`] triangles. Of more, a [tree]
 //! chooses by the point that is lit. Nine tenths of the shares of shapes and beams go by power (luminance x area x pi), one tenth is dealt
-//! evenly; a primitive of a shape has its share of the area. The probabilities are multiples of 2^-32, intervals of integers, so one 32-bit
+//! evenly; a primitive of a shape has its share of the area. Within the tree nothing is dealt evenly: these shares only say how often it is asked,
+//! and whoever may shine at the point has one number at least. The probabilities are multiples of 2^-32, intervals of integers, so one 32-bit
 //! number chooses exactly by them and both sides of MIS see the same ones.
 //! Without a tree, a primitive whose share is below 2^-32 is never chosen; its density is 0, and MIS leaves it to the BSDF.
 
