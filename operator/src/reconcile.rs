@@ -41,6 +41,8 @@ const LOOK: Duration = Duration::from_secs(1);
 const SOON: Duration = Duration::from_millis(200);
 /// A known scene is found within this time, or prepared again.
 const LOOK_UP: SignedDuration = SignedDuration::from_secs(5);
+/// A pod that is to end is taken for ended so long after its grace period, when its node does not say: it may be gone for good.
+const SILENT: SignedDuration = SignedDuration::from_secs(30);
 /// Before a job whose surroundings are not there (yet) is looked at again.
 const AGAIN: Duration = Duration::from_secs(10);
 
@@ -434,15 +436,23 @@ async fn delete_pod(pods: &Api<Pod>, name: &str) -> Result<(), Error> {
     }
 }
 
-async fn remove_pods(job: &RenderJobObject, context: &Context, namespace: &str, uid: &str) -> Result<(), Error> {
+/// Deletes a job's pods; whether none of them can write to the storage any more.
+async fn remove_pods(job: &RenderJobObject, context: &Context, namespace: &str, uid: &str) -> Result<bool, Error> {
     let pods: Api<Pod> = Api::namespaced(context.client.clone(), namespace);
     context.metrics.forget(namespace, &job.name_any());
-    for pod in list_pods(&pods, uid).await? {
-        if pod.metadata.deletion_timestamp.is_none() {
-            delete_pod(&pods, &pod.name_any()).await?;
-        }
+    let found = list_pods(&pods, uid).await?;
+    for pod in found.iter().filter(|p| p.metadata.deletion_timestamp.is_none()) {
+        delete_pod(&pods, &pod.name_any()).await?;
     }
-    Ok(())
+    Ok(!found.iter().any(|p| may_write(p, Timestamp::now())))
+}
+
+fn may_write(pod: &Pod, now: Timestamp) -> bool {
+    let phase = pod.status.as_ref().and_then(|s| s.phase.as_deref());
+    let ended = matches!(phase, Some("Succeeded" | "Failed"));
+    // the time that a deleted pod carries is the end of its grace period
+    let silent = pod.metadata.deletion_timestamp.as_ref().is_some_and(|Time(t)| now.duration_since(*t) > SILENT);
+    !ended && !silent
 }
 
 /// Writes the status, if it says something new.
@@ -495,7 +505,10 @@ async fn delete(job: &RenderJobObject, context: &Context, jobs: &Api<Seen>, uid:
         return Ok(Action::requeue(SOON));
     }
     let namespace = job.namespace().unwrap_or_default();
-    context.metrics.forget(&namespace, &job.name_any());
+    // what a worker is about to write would stay for ever
+    if !remove_pods(job, context, &namespace, uid).await? {
+        return Ok(Action::requeue(SOON));
+    }
     match depot(context, job, &namespace).await {
         Ok((_, depot)) => match finish::clean(&depot, uid).await {
             Ok(()) => {}

@@ -4,6 +4,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use hyper::{Request, Response};
+use k8s_openapi::jiff::{SignedDuration, Timestamp};
 use kube::Client;
 use kube::client::Body;
 use kube::runtime::controller::Action;
@@ -231,11 +232,48 @@ async fn a_deleted_job_goes_even_when_its_storage_went_first() {
     assert_eq!(done, Ok(Action::await_change()), "it is not ours any more");
     deleted["metadata"]["finalizers"] = json!(["other/one", FINALIZER]);
     let steps = vec![
+        step("GET", PODS, 200, no_pods()),
         step("GET", PROFILE, 404, not_found()),
         step("PATCH", JOB, 200, deleted.clone()).with("/metadata/finalizers", json!(["other/one"])),
     ];
     let (done, ..) = scenario(&deleted, steps).await;
     assert_eq!(done, Ok(Action::await_change()));
+}
+
+#[tokio::test]
+async fn what_a_deleted_job_wrote_is_looked_for_when_none_of_its_workers_writes_any_more() {
+    let mut deleted = job();
+    deleted["metadata"]["deletionTimestamp"] = json!("2026-01-01T00:00:00Z");
+    deleted["metadata"]["finalizers"] = json!([FINALIZER]);
+    let pods = |metadata: Value, phase: &str| {
+        let pod = json!({"metadata": metadata, "status": {"phase": phase}});
+        json!({"kind": "PodList", "apiVersion": "v1", "metadata": {}, "items": [pod]})
+    };
+    let name = "box-w0";
+    let pod = json!({"kind": "Pod", "apiVersion": "v1", "metadata": {"name": name}});
+    let delete = || step("DELETE", "/api/v1/namespaces/studio/pods/box-w0?", 200, pod.clone());
+    let soon = (Timestamp::now() + SignedDuration::from_secs(20)).to_string();
+    let (past, living) = (json!({"name": name, "deletionTimestamp": "2026-01-01T00:00:00Z"}), json!({"name": name}));
+    let ending = json!({"name": name, "deletionTimestamp": soon});
+    for (pods, more) in [(pods(living.clone(), "Running"), vec![delete()]), (pods(ending.clone(), "Running"), vec![])] {
+        let steps = [step("GET", PODS, 200, pods)].into_iter().chain(more).collect();
+        let (done, ..) = scenario(&deleted, steps).await;
+        assert_ne!(done.unwrap(), Action::await_change(), "it is looked at again");
+    }
+    let ended = [
+        (pods(living, "Failed"), vec![delete()]),
+        (pods(ending, "Succeeded"), vec![]),
+        (pods(past, "Running"), vec![]),
+    ];
+    for (pods, more) in ended {
+        let last = [
+            step("GET", PROFILE, 404, not_found()),
+            step("PATCH", JOB, 200, deleted.clone()).with("/metadata/finalizers", json!([])),
+        ];
+        let steps = [step("GET", PODS, 200, pods)].into_iter().chain(more).chain(last).collect();
+        let (done, ..) = scenario(&deleted, steps).await;
+        assert_eq!(done, Ok(Action::await_change()));
+    }
 }
 
 #[tokio::test]
@@ -308,6 +346,7 @@ async fn a_job_that_cannot_be_read_fails_alone() {
     bad["spec"]["storage"] = json!({"profile": "other"});
     let steps = vec![
         step("GET", GET_JOB, 200, bad.clone()),
+        step("GET", PODS, 200, no_pods()),
         step("GET", "/api/v1/namespaces/rayherd/configmaps/rayherd-storage-other", 404, not_found()),
         step("PATCH", JOB, 200, bad.clone()).with("/metadata/finalizers", json!([])),
     ];
