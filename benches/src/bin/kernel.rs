@@ -50,19 +50,19 @@ fn load(dir: &Path, blocks: usize) -> anyhow::Result<Forest> {
     let ids: Vec<PrimId> = (0..triangles.len() as u64).collect();
     let part = triangles.len().div_ceil(blocks.max(1)).max(1);
     let mut forest = Forest::new(triangles.len() as u64 * 80 + (64 << 20))?;
-    let (wall, cpu) = (std::time::Instant::now(), process_cpu()?);
+    let (wall, cpu) = (std::time::Instant::now(), process_cpu());
     let mut objects = Vec::new();
     for (t, i) in triangles.chunks(part).zip(ids.chunks(part)) {
         objects.push(build_block(t, i, &[], &[], &Rayon)?);
     }
-    let (built, built_cpu) = (wall.elapsed().as_secs_f64(), process_cpu()? - cpu);
-    let cpu = thread_cpu()?;
+    let (built, built_cpu) = (wall.elapsed().as_secs_f64(), process_cpu() - cpu);
+    let cpu = thread_cpu();
     for object in &objects {
         forest.insert(object)?;
     }
-    let inserted = thread_cpu()? - cpu;
+    let inserted = thread_cpu() - cpu;
     forest.finish()?;
-    let finished = thread_cpu()? - cpu - inserted;
+    let finished = thread_cpu() - cpu - inserted;
     println!(
         "{} triangles, {} blocks: build wall {built:.2} s, cpu {built_cpu:.2} s; check and insert {inserted:.3} s, top {finished:.3} s; {:.1} bytes a triangle",
         triangles.len(),
@@ -87,13 +87,13 @@ fn measure(dir: &Path, repetitions: usize, blocks: usize, kernels: &[Kernel]) ->
                 if tracer.kernel() == Kernel::Scalar && round > 0 {
                     continue;
                 }
-                let (before, cpu) = (tracer.counters(), thread_cpu()?);
+                let (before, cpu) = (tracer.counters(), thread_cpu());
                 if is_shadow {
                     tracer.any(&forest, &rays, &mut occluded);
                 } else {
                     tracer.closest(&forest, &rays, &mut hits);
                 }
-                times.push(thread_cpu()? - cpu);
+                times.push(thread_cpu() - cpu);
                 if round == 0 {
                     let after = tracer.counters();
                     visits.push((after.nodes - before.nodes, after.leaves - before.leaves));

@@ -85,9 +85,9 @@ struct Timed {
 }
 
 fn timed(work: impl FnOnce() -> anyhow::Result<FilmPart>) -> anyhow::Result<Timed> {
-    let (start, before) = (Instant::now(), process_cpu()?);
+    let (start, before) = (Instant::now(), process_cpu());
     let film = work()?;
-    Ok(Timed { film, cpu: process_cpu()? - before, wall: start.elapsed().as_secs_f64() })
+    Ok(Timed { film, cpu: process_cpu() - before, wall: start.elapsed().as_secs_f64() })
 }
 
 fn by_job(scene: &PreparedScene, frame: &Frame, spp: u32, threads: u32) -> anyhow::Result<FilmPart> {

@@ -60,12 +60,12 @@ struct Run {
 
 fn measure(path: &Path, iso: Option<f64>) -> anyhow::Result<Run> {
     let store = MemoryObjects::default();
-    let start = thread_cpu()?;
+    let start = thread_cpu();
     let description = import(path, &ImportOptions { iso, ..ImportOptions::default() })?;
     let source = DescriptionSource::new(&description, StreamOptions::default());
     let (settings, spool) = (PrepareSettings::default(), SpoolSettings::default());
     let prepared = prepare(&description, &source, &settings, &spool, &store, &NoProgress)?;
-    let cpu = thread_cpu()? - start;
+    let cpu = thread_cpu() - start;
     Ok(Run { triangles: prepared.manifest.counts.triangles, cpu, tree: prepared.report.tree_s })
 }
 

@@ -1,28 +1,25 @@
 //! CPU time of the calling thread.
 
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
-/// Measures from its making.
-pub(crate) struct Clock {
-    started: Instant,
-    cpu: Option<u64>,
-}
+use rustix::time::{ClockId, clock_gettime};
+
+/// Measures from its making, on the thread that made it.
+pub(crate) struct Clock(Duration);
 
 impl Clock {
     pub(crate) fn start() -> Self {
-        Clock { started: Instant::now(), cpu: thread_nanoseconds() }
+        Clock(now())
     }
 
-    /// CPU time of this thread since; time on the wall where the system does not tell a thread's.
+    /// CPU time of this thread since.
     pub(crate) fn elapsed(&self) -> Duration {
-        match (self.cpu, thread_nanoseconds()) {
-            (Some(before), Some(now)) => Duration::from_nanos(now.saturating_sub(before)),
-            _ => self.started.elapsed(),
-        }
+        now().saturating_sub(self.0)
     }
 }
 
-/// The kernel's account, brought up to date at each of its ticks.
-fn thread_nanoseconds() -> Option<u64> {
-    std::fs::read_to_string("/proc/thread-self/schedstat").ok()?.split(' ').next()?.parse().ok()
+fn now() -> Duration {
+    let t = clock_gettime(ClockId::ThreadCPUTime);
+    // never negative
+    Duration::new(t.tv_sec.unsigned_abs(), t.tv_nsec as u32)
 }

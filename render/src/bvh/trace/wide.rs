@@ -25,8 +25,8 @@ use super::vector::{Avx2, Avx512, InstructionSet, sort4, sort8};
 use super::{Counters, Kernel, accept, runs};
 use crate::ray::Ray;
 
-/// Rays in flight; fewer cannot hide the latencies, more gain nothing (measured).
-const IN_FLIGHT: usize = 32;
+/// Rays in flight; 32 are 1 to 14 % slower where the tree is larger than the caches, 64 are no faster (docs/benchmarks/tried.md).
+const IN_FLIGHT: usize = 48;
 /// In the place of a reference: the ray is done. No leaf has it: its eight primitives would pass the arena's end.
 const DONE: u32 = u32::MAX;
 /// Entries below the bottom of each stack, so that eight can be read at once. Their keys are above every distance.
