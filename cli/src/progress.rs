@@ -89,6 +89,10 @@ impl Progress for Display {
         }
     }
 
+    fn wants_error(&self) -> bool {
+        true
+    }
+
     fn wants_preview(&self) -> bool {
         self.preview.is_some() && {
             let state = self.state();

@@ -20,6 +20,16 @@ pub trait Blocks {
     fn attributes(&self, split: u32) -> Result<Vec<u8>, JobError>;
 }
 
+/// Straight from the scene's store, uncounted.
+impl Blocks for PreparedScene {
+    fn geometry(&self, split: u32) -> Result<Vec<u8>, JobError> {
+        Ok(self.objects.get(&self.manifest.splits[split as usize].geometry)?)
+    }
+    fn attributes(&self, split: u32) -> Result<Vec<u8>, JobError> {
+        Ok(self.objects.get(&self.manifest.splits[split as usize].attributes)?)
+    }
+}
+
 /// Splits in memory, ready to be traced and shaded.
 pub struct Resident {
     splits: SplitSet,

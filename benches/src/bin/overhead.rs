@@ -12,9 +12,9 @@ use std::time::Instant;
 use anyhow::{Context as _, ensure};
 use rayherd_api::{ImageSize, RenderJobSpec, Strategy};
 use rayherd_benches::{interval, median, process_cpu};
-use rayherd_herd::job::{self, JobError, JobSettings, NodeSpec, PreparedScene, Sampling, Silent};
+use rayherd_herd::job::{self, JobSettings, NodeSpec, PreparedScene, Sampling, Silent};
 use rayherd_herd::local::render_local;
-use rayherd_herd::resident::{Blocks, Resident};
+use rayherd_herd::resident::Resident;
 use rayherd_render::bvh::{Kernel, Tracer};
 use rayherd_render::film::{FilmPart, TILE};
 use rayherd_render::frame::Frame;
@@ -101,23 +101,11 @@ fn by_job(scene: &PreparedScene, frame: &Frame, spp: u32, threads: u32) -> anyho
     Ok(render_local(scene, frame, &sampling, &settings, &Silent)?.film)
 }
 
-struct InMemory<'a>(&'a PreparedScene);
-
-impl Blocks for InMemory<'_> {
-    fn geometry(&self, split: u32) -> Result<Vec<u8>, JobError> {
-        Ok(self.0.objects.get(&self.0.manifest.splits[split as usize].geometry)?)
-    }
-    fn attributes(&self, split: u32) -> Result<Vec<u8>, JobError> {
-        Ok(self.0.objects.get(&self.0.manifest.splits[split as usize].attributes)?)
-    }
-}
-
 /// Tile by tile, depth first: the same calls as a task makes, and nothing around them.
 fn by_loop(scene: &PreparedScene, frame: &Frame, spp: u32) -> anyhow::Result<FilmPart> {
-    let blocks = InMemory(scene);
     let splits: Vec<u32> = (0..scene.splits()).collect();
-    let resident = Resident::load(scene, &splits, &blocks)?;
-    let surfaces = resident.surfaces(scene, &blocks)?;
+    let resident = Resident::load(scene, &splits, scene)?;
+    let surfaces = resident.surfaces(scene, scene)?;
     let context = Context::new(&scene.world, &scene.lights, frame);
     let mut tracer = Tracer::new(Kernel::Auto)?;
     let mut film = FilmPart::new(frame.size);

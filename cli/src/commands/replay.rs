@@ -6,7 +6,7 @@ use std::process::ExitCode;
 use clap::Args;
 use rayherd_api::{RenderJob, RenderJobSpec};
 use rayherd_herd::job::{JobError, PreparedScene};
-use rayherd_herd::resident::{Blocks, Resident};
+use rayherd_herd::resident::Resident;
 use rayherd_herd::textures::{DEFAULT_BUDGET, StoredTiles, TaskTextures, TileCache};
 use rayherd_render::bvh::{Kernel, Tracer};
 use rayherd_render::film::FilmPart;
@@ -60,9 +60,8 @@ pub fn run(arguments: &Arguments) -> anyhow::Result<ExitCode> {
     }
     let scene = PreparedScene::open(prepared.manifest, objects)?;
     let all: Vec<u32> = (0..scene.splits()).collect();
-    let blocks = Stored(&scene);
-    let resident = Resident::load(&scene, &all, &blocks)?;
-    let surfaces = resident.surfaces(&scene, &blocks)?;
+    let resident = Resident::load(&scene, &all, &scene)?;
+    let surfaces = resident.surfaces(&scene, &scene)?;
     let mut replay = Replay {
         scene: &scene,
         resident: &resident,
@@ -105,18 +104,6 @@ pub fn run(arguments: &Arguments) -> anyhow::Result<ExitCode> {
 
 fn pixel(text: &str) -> Result<[u32; 2], String> {
     <[u32; 2]>::try_from(numbers(text)?).map_err(|n| format!("has {} numbers: give two, X,Y", n.len()))
-}
-
-/// Blocks straight from the scene's store.
-struct Stored<'a>(&'a PreparedScene);
-
-impl Blocks for Stored<'_> {
-    fn geometry(&self, split: u32) -> Result<Vec<u8>, JobError> {
-        Ok(self.0.objects.get(&self.0.manifest.splits[split as usize].geometry)?)
-    }
-    fn attributes(&self, split: u32) -> Result<Vec<u8>, JobError> {
-        Ok(self.0.objects.get(&self.0.manifest.splits[split as usize].attributes)?)
-    }
 }
 
 struct Replay<'a> {

@@ -100,7 +100,7 @@ impl<F: FilmSum> Driver<'_, '_, F> {
             self.progress.preview(&image);
         }
         // for the display: about, since some pixels may wait for samples that others have. What decides is in `step_done`
-        if Instant::now() >= self.next_error {
+        if self.progress.wants_error() && Instant::now() >= self.next_error {
             let begun = Instant::now();
             self.error = self.film.shown_error(self.ledger.taken().reach()).or(self.error);
             self.next_error = Instant::now() + ERROR_EVERY.max(ERROR_SHARE * begun.elapsed());

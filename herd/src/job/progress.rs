@@ -48,6 +48,10 @@ pub trait Progress: Send + Sync {
     fn is_cancelled(&self) -> bool {
         false
     }
+    /// Whether the error of the picture so far is wanted; asked after a commit. It costs up to 2 % of the time.
+    fn wants_error(&self) -> bool {
+        false
+    }
     /// The image so far.
     fn preview(&self, _image: &Image) {}
 }

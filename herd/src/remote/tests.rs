@@ -205,6 +205,32 @@ impl Cluster {
             result
         })
     }
+
+    /// A job with a worker beside each of three stores, while something happens: it is given the fleet and whether the job is over.
+    fn beside(
+        &self,
+        (spec, kept, session): (&RenderJobSpec, &Arc<Kept>, &str),
+        change: impl for<'a> FnOnce(Job<'a>) -> Job<'a> + Send,
+        meanwhile: impl FnOnce(&Fleet, &dyn Fn() -> bool),
+    ) -> Result<(), JobError> {
+        let (fleet, depot) = (Fleet::new(3, session), self.depot(None));
+        let wire = self.wire(&fleet);
+        std::thread::scope(|scope| {
+            for number in 0..3 {
+                let station = self.station(&wire, number, session, Some(number));
+                scope.spawn(move || station.run().unwrap());
+            }
+            let keeper: Arc<dyn Keeper> = kept.clone();
+            let (fleet, depot) = (&fleet, &depot);
+            let job = scope.spawn(move || {
+                let result = run(&change(self.job(spec, depot, fleet, session)), &keeper, &Silent);
+                fleet.end();
+                result
+            });
+            meanwhile(fleet, &|| job.is_finished());
+            job.join().unwrap()
+        })
+    }
 }
 
 fn wait_for(what: impl Fn() -> bool) {
@@ -281,39 +307,22 @@ fn workers_and_operators_that_go_change_no_byte() {
     let committed = kept.newest(0).unwrap().0;
     assert!(committed >= 6);
     // a record that was written beyond the pointer does not count
-    let second = Fleet::new(3, "e2");
-    let wire = cluster.wire(&second);
-    std::thread::scope(|scope| {
-        for number in 0..3 {
-            let station = cluster.station(&wire, number, "s2", Some(number));
-            scope.spawn(move || station.run().unwrap());
-        }
-        let keeper: Arc<dyn Keeper> = kept.clone();
-        run(&cluster.job(&spec, &depot, &second, "e2"), &keeper, &Silent).unwrap();
-        second.end();
-    });
+    cluster.beside((&spec, &kept, "e2"), |job| job, |_, _| {}).unwrap();
     assert!(cluster.picture(2) == want);
     assert!(kept.reports.lock().unwrap()[0].tasks_reused > 0);
 }
 
 /// Runs a job until so many records count, then stops its operator.
 fn begun(cluster: &Cluster, spec: &RenderJobSpec, kept: &Arc<Kept>, records: u64) {
-    let (fleet, depot) = (Fleet::new(3, "e1"), cluster.depot(None));
-    let wire = cluster.wire(&fleet);
-    std::thread::scope(|scope| {
-        for number in 0..3 {
-            let station = cluster.station(&wire, number, "s1", Some(number));
-            scope.spawn(move || station.run().unwrap());
-        }
-        let keeper: Arc<dyn Keeper> = kept.clone();
-        let (depot, fleet) = (&depot, &fleet);
-        let job = scope.spawn(move || run(&cluster.job(spec, depot, fleet, "e1"), &keeper, &Silent));
-        wait_for(|| kept.newest(0).is_some_and(|p| p.0 >= records) || job.is_finished());
-        fleet.cancel("stopped by the test");
-        let stopped = job.join().unwrap();
-        assert!(matches!(stopped, Err(JobError::Owned(_))), "{:?}", stopped.err());
-        fleet.end();
-    });
+    let stopped = cluster.beside(
+        (spec, kept, "e1"),
+        |job| job,
+        |fleet, is_over| {
+            wait_for(|| kept.newest(0).is_some_and(|p| p.0 >= records) || is_over());
+            fleet.cancel("stopped by the test");
+        },
+    );
+    assert!(matches!(stopped, Err(JobError::Owned(_))), "{:?}", stopped.err());
 }
 
 #[test]
@@ -410,26 +419,17 @@ fn a_worker_that_comes_back_under_another_session_loses_only_its_tasks() {
 fn a_store_that_goes_while_rays_wait_costs_copies_and_no_byte() {
     let spec = spec(Strategy::SchedulingGridOverlapReduced, 4, 2);
     let (cluster, kept) = (Cluster::new(3), Arc::new(Kept::default()));
-    let (fleet, depot) = (Fleet::new(3, "e"), cluster.depot(None));
-    let wire = cluster.wire(&fleet);
-    std::thread::scope(|scope| {
-        for number in 0..3 {
-            let station = cluster.station(&wire, number, "s", Some(number));
-            scope.spawn(move || station.run().unwrap());
-        }
-        let keeper: Arc<dyn Keeper> = kept.clone();
-        let (spec, depot, fleet, cluster) = (&spec, &depot, &fleet, &cluster);
-        let job = scope.spawn(move || {
-            let result = run(&cluster.job(spec, depot, fleet, "e"), &keeper, &Silent);
-            fleet.end();
-            result
-        });
-        wait_for(|| kept.newest(0).is_some_and(|p| p.0 >= 3));
-        cluster.stores[1].lose();
-        if let Err(e) = job.join().unwrap() {
-            panic!("{e}");
-        }
-    });
+    let done = cluster.beside(
+        (&spec, &kept, "e"),
+        |job| job,
+        |_, _| {
+            wait_for(|| kept.newest(0).is_some_and(|p| p.0 >= 3));
+            cluster.stores[1].lose();
+        },
+    );
+    if let Err(e) = done {
+        panic!("{e}");
+    }
     assert!(cluster.picture(2) == expected(&spec));
     assert_eq!(kept.reports.lock().unwrap()[0].tasks_redone, 0);
 }
@@ -439,27 +439,17 @@ fn a_machine_whose_plug_is_pulled_costs_its_copies_and_no_byte() {
     let mut spec = spec(Strategy::SchedulingGridOverlapReduced, 4, 2);
     spec.task_seconds = Some(0.003);
     let (cluster, kept) = (Cluster::new(3), Arc::new(Kept::default()));
-    let (fleet, depot) = (Fleet::new(3, "e"), cluster.depot(None));
-    let wire = cluster.wire(&fleet);
-    std::thread::scope(|scope| {
-        for number in 0..3 {
-            let station = cluster.station(&wire, number, "s", Some(number));
-            scope.spawn(move || station.run().unwrap());
-        }
-        let keeper: Arc<dyn Keeper> = kept.clone();
-        let (spec, depot, fleet, cluster) = (&spec, &depot, &fleet, &cluster);
-        let job = scope.spawn(move || {
-            let job = Job { patience: Duration::ZERO, ..cluster.job(spec, depot, fleet, "e") };
-            let result = run(&job, &keeper, &Silent);
-            fleet.end();
-            result
-        });
-        wait_for(|| kept.newest(0).is_some_and(|p| p.0 >= 3));
-        cluster.stores[1].hang(true);
-        if let Err(e) = job.join().unwrap() {
-            panic!("{e}");
-        }
-    });
+    let done = cluster.beside(
+        (&spec, &kept, "e"),
+        |job| Job { patience: Duration::ZERO, ..job },
+        |_, _| {
+            wait_for(|| kept.newest(0).is_some_and(|p| p.0 >= 3));
+            cluster.stores[1].hang(true);
+        },
+    );
+    if let Err(e) = done {
+        panic!("{e}");
+    }
     assert!(cluster.picture(2) == expected(&spec));
     assert_eq!(kept.reports.lock().unwrap()[0].tasks_redone, 0);
     // who asked it when the plug was pulled, and nobody later
@@ -484,19 +474,8 @@ fn a_job_whose_scene_is_known_needs_its_source_no_more() {
     let scene = kept.prepared.lock().unwrap()[0].0.hash.to_string();
     cluster.runtime.block_on(cluster.stores[0].delete(&[SOURCE.to_owned(), TEXTURE.to_owned()])).unwrap();
     let again = |known: Option<String>| {
-        let (fleet, depot) = (Fleet::new(3, "f"), cluster.depot(None));
-        let wire = cluster.wire(&fleet);
-        std::thread::scope(|scope| {
-            for number in 0..3 {
-                let station = cluster.station(&wire, number, "s", Some(number));
-                scope.spawn(move || station.run().unwrap());
-            }
-            let keeper: Arc<dyn Keeper> = Arc::new(Kept::default());
-            let job = Job { known, prefix: "jobs/2".into(), ..cluster.job(&spec, &depot, &fleet, "f") };
-            let result = run(&job, &keeper, &Silent);
-            fleet.end();
-            result
-        })
+        let kept = Arc::new(Kept::default());
+        cluster.beside((&spec, &kept, "f"), |job| Job { known, prefix: "jobs/2".into(), ..job }, |_, _| {})
     };
     assert!(again(None).unwrap_err().to_string().contains("upload the scene first"));
     cluster.runtime.block_on(cluster.stores[0].delete(&["out/a.exr".to_owned()])).unwrap();

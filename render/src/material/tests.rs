@@ -94,6 +94,32 @@ fn any_principled(rng: &mut Rng) -> Principled {
     }
 }
 
+/// Compares n sampled directions, after snapping, with the density integrated over bins; what was not sampled is what the integral lacks. Whether
+/// they were compared bin by bin too: narrow peaks are beyond the quadrature.
+fn follows_density(bsdf: &Bsdf, front: bool, wo: Vec3, n: u32, midpoints: usize, rng: &mut Rng) -> bool {
+    let bins = 20;
+    let (mut counts, mut elsewhere) = (vec![0.0; 2 * bins * bins], 0.0);
+    for _ in 0..n {
+        match bsdf.sample(wo, front, [rng.f32(), rng.f32()], rng.f32()) {
+            Some(Sampled { wi, delta: None }) => {
+                let wi = Vec3::from(UnitDir::encode(wi.to_array()).decode());
+                counts[sphere_bin(wi, bins)] += 1.0;
+            }
+            _ => elsewhere += 1.0,
+        }
+    }
+    let mut expected = integrate_bins(bins, midpoints, |wi| f64::from(bsdf.eval(wo, wi, front).pdf));
+    let sum: f64 = expected.iter().sum();
+    let missing = 1.0 - elsewhere / f64::from(n) - sum;
+    assert!(missing.abs() < 0.01, "{bsdf:?} {front} {wo}: density integrates to {sum}, {elsewhere} elsewhere");
+    let is_smooth = missing.abs() < 5e-4 && sum > 0.1;
+    if is_smooth {
+        expected.iter_mut().for_each(|e| *e *= f64::from(n));
+        chi_square(&counts, &expected);
+    }
+    is_smooth
+}
+
 /// Principled with random parameters: samples follow the density, whose integral is what is not lost; directions may be exchanged.
 #[test]
 fn principled_in_any_mixture() {
@@ -103,28 +129,9 @@ fn principled_in_any_mixture() {
         let p = any_principled(&mut rng);
         let (bsdf, front) = (Bsdf::Principled(p), i % 4 != 0);
         for wo in [local(0.4, 0.3), local(1.2, 2.0)] {
-            let (bins, n) = (20, 60_000);
-            let (mut counts, mut lost) = (vec![0.0; 2 * bins * bins], 0.0);
-            for _ in 0..n {
-                match bsdf.sample(wo, front, [rng.f32(), rng.f32()], rng.f32()) {
-                    Some(Sampled { wi, delta: None }) => {
-                        let wi = Vec3::from(UnitDir::encode(wi.to_array()).decode());
-                        counts[sphere_bin(wi, bins)] += 1.0;
-                    }
-                    _ => lost += 1.0,
-                }
-            }
             // the coat's peak is as narrow as a degree
             let midpoints = if p.clearcoat > 0.0 { 60 } else { 30 };
-            let mut expected = integrate_bins(bins, midpoints, |wi| f64::from(bsdf.eval(wo, wi, front).pdf));
-            let sum: f64 = expected.iter().sum();
-            let missing = 1.0 - lost / f64::from(n) - sum;
-            assert!(missing.abs() < 0.01, "{p:?} {front} {wo}: {sum}, lost {lost}");
-            if missing.abs() < 5e-4 && sum > 0.1 {
-                expected.iter_mut().for_each(|e| *e *= f64::from(n));
-                chi_square(&counts, &expected);
-                compared += 1;
-            }
+            compared += u32::from(follows_density(&bsdf, front, wo, 60_000, midpoints, &mut rng));
         }
         for _ in 0..500 {
             let mut up = || {
@@ -246,30 +253,9 @@ fn samples_follow_the_density() {
     let mut rng = Rng(1);
     for (bsdf, front) in all() {
         for wo in views() {
-            let bins = 20;
-            let n = 100_000;
-            let mut counts = vec![0.0; 2 * bins * bins];
-            let mut elsewhere = 0.0;
-            for _ in 0..n {
-                match bsdf.sample(wo, front, [rng.f32(), rng.f32()], rng.f32()) {
-                    Some(Sampled { wi, delta: None }) => {
-                        let wi = Vec3::from(UnitDir::encode(wi.to_array()).decode());
-                        counts[sphere_bin(wi, bins)] += 1.0;
-                    }
-                    _ => elsewhere += 1.0,
-                }
-            }
             // refraction narrows a lobe
             let midpoints = if bsdf.transmits() { 45 } else { 30 };
-            let mut expected = integrate_bins(bins, midpoints, |wi| f64::from(bsdf.eval(wo, wi, front).pdf));
-            let sum: f64 = expected.iter().sum();
-            let missing = 1.0 - elsewhere / f64::from(n) - sum;
-            assert!(missing.abs() < 0.01, "{bsdf:?} {front} {wo}: density integrates to {sum}, {elsewhere} elsewhere");
-            // narrow peaks are beyond the quadrature
-            if missing.abs() < 5e-4 && sum > 0.1 {
-                expected.iter_mut().for_each(|e| *e *= f64::from(n));
-                chi_square(&counts, &expected);
-            }
+            follows_density(&bsdf, front, wo, 100_000, midpoints, &mut rng);
         }
     }
 }

@@ -4,6 +4,7 @@ use std::sync::atomic::{AtomicU32, Ordering};
 use rayherd_render::attributes::AttributeBlock;
 use rayherd_render::bvh::{Forest, Kernel, Tracer};
 use rayherd_render::ray::{Hit, Ray};
+use rayherd_tests::mutation::Random;
 
 use super::*;
 use crate::description::{Affine, Bsdf, Geometry, Material, Place, Shape};
@@ -63,28 +64,21 @@ fn description(name: &str) -> Description {
     }
 }
 
-struct Random(u64);
-
-impl Random {
-    fn next(&mut self) -> f64 {
-        self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
-        let mut z = self.0;
-        z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-        z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-        ((z ^ (z >> 31)) >> 11) as f64 / (1u64 << 53) as f64
-    }
+/// In 0 to 1.
+fn unit(random: &mut Random) -> f64 {
+    (random.bits() >> 11) as f64 / (1u64 << 53) as f64
 }
 
 /// Small triangles along a winding path, with walls, spheres, normals, and things to skip in between.
 fn scene(seed: u64, count: usize) -> Vec<Record> {
-    let mut random = Random(seed);
+    let mut random = Random::new(seed);
     let mut at = [0.0f64; 3];
     let mut out = Vec::new();
     for i in 0..count {
         for x in &mut at {
-            *x = (*x + 0.6 * (random.next() - 0.5)).clamp(-3.0, 3.0);
+            *x = (*x + 0.6 * (unit(&mut random) - 0.5)).clamp(-3.0, 3.0);
         }
-        let mut corner = |size: f64| at.map(|x| 1000.0 + x + size * (random.next() - 0.5));
+        let mut corner = |size: f64| at.map(|x| 1000.0 + x + size * (unit(&mut random) - 0.5));
         let size = if i % 97 == 13 { 6.0 } else { 0.2 };
         let mut t = TriangleRecord {
             p: [corner(size), corner(size), corner(size)],
@@ -103,7 +97,7 @@ fn scene(seed: u64, count: usize) -> Vec<Record> {
             }
             7 | 8 => Record::Sphere(SphereRecord {
                 center: t.p[0],
-                radius: if i % 80 == 7 { 0.0 } else { 0.1 + random.next() },
+                radius: if i % 80 == 7 { 0.0 } else { 0.1 + unit(&mut random) },
                 flipped: i % 80 == 8,
                 shape: 0,
             }),
@@ -406,7 +400,7 @@ fn trace(forest: &Forest, tracer: &mut Tracer, ray: &Ray) -> Option<(f32, u64)> 
 #[test]
 fn routing_finds_the_nearest_hit_of_the_whole_scene() {
     let records = scene(10, 4000);
-    let mut random = Random(77);
+    let mut random = Random::new(77);
     for reduce in [true, false] {
         let store = MemoryObjects::new();
         let manifest = run(&records, &settings(13, reduce), &store).unwrap().manifest;
@@ -430,7 +424,8 @@ fn routing_finds_the_nearest_hit_of_the_whole_scene() {
         let mut tracer = Tracer::new(Kernel::Auto).unwrap();
         let (mut hits, mut visits) = (0, 0);
         for i in 0..4000 {
-            let mut point = |size: f64| -> [f32; 3] { std::array::from_fn(|_| (size * (random.next() - 0.5)) as f32) };
+            let mut point =
+                |size: f64| -> [f32; 3] { std::array::from_fn(|_| (size * (unit(&mut random) - 0.5)) as f32) };
             let (o, target) = (point(if i % 3 == 0 { 200.0 } else { 8.0 }), point(6.0));
             let mut d: [f32; 3] = std::array::from_fn(|a| target[a] - o[a]);
             if i % 5 == 0 {

@@ -15,6 +15,14 @@ fn bad(bsdf: &str) -> String {
     message(&format!("<shape type=\"cube\">\n{bsdf}</shape>"))
 }
 
+/// What is told of a model with this inside.
+fn refused(model: &str, cases: &[(&str, &str)]) {
+    for (inside, what) in cases {
+        let told = bad(&format!("<bsdf type=\"{model}\">{inside}</bsdf>"));
+        assert!(told.contains("s.xml:3") && told.contains(what), "{told}");
+    }
+}
+
 #[test]
 fn principled_is_read() {
     let out = read("<bsdf type=\"principled\"/>");
@@ -37,16 +45,16 @@ fn principled_is_read() {
     assert!(p.spec_trans == 0.35 && p.flatness == 0.45 && p.eta == 1.001);
     let textured = &material(&out).detail.as_ref().unwrap().textured;
     assert!(textured.len() == 1 && textured[0].slot == Slot::Roughness, "{textured:?}");
-    for (inside, what) in [
-        ("<float name=\"roughness\" value=\"1.5\"/>", "roughness 1.5 should lie in [0, 1]"),
-        ("<float name=\"sheen\" value=\"-1\"/>", "sheen -1 should lie in [0, 1]"),
-        ("<float name=\"eta\" value=\"0\"/>", "eta 0 should lie between"),
-        ("<float name=\"eta\" value=\"1.4\"/><float name=\"specular\" value=\"0.4\"/>", "both eta and specular"),
-        ("<float name=\"wobble\" value=\"1\"/>", "property \"wobble\" of bsdf \"principled\""),
-    ] {
-        let told = bad(&format!("<bsdf type=\"principled\">{inside}</bsdf>"));
-        assert!(told.contains("s.xml:3") && told.contains(what), "{told}");
-    }
+    refused(
+        "principled",
+        &[
+            ("<float name=\"roughness\" value=\"1.5\"/>", "roughness 1.5 should lie in [0, 1]"),
+            ("<float name=\"sheen\" value=\"-1\"/>", "sheen -1 should lie in [0, 1]"),
+            ("<float name=\"eta\" value=\"0\"/>", "eta 0 should lie between"),
+            ("<float name=\"eta\" value=\"1.4\"/><float name=\"specular\" value=\"0.4\"/>", "both eta and specular"),
+            ("<float name=\"wobble\" value=\"1\"/>", "property \"wobble\" of bsdf \"principled\""),
+        ],
+    );
 }
 
 #[test]
@@ -54,8 +62,7 @@ fn phong_is_read() {
     let text = "<bsdf type=\"phong\"><float name=\"exponent\" value=\"80\"/><spectrum name=\"specularReflectance\" value=\"0.4\"/></bsdf>";
     let Bsdf::Phong { diffuse, specular, exponent } = material(&read(text)).bsdf else { panic!("no phong") };
     assert_eq!((diffuse, specular, exponent), ([0.5; 3], [0.4; 3], 80.0));
-    let told = bad("<bsdf type=\"phong\"><float name=\"exponent\" value=\"-1\"/></bsdf>");
-    assert!(told.contains("s.xml:3") && told.contains("exponent -1 should lie"), "{told}");
+    refused("phong", &[("<float name=\"exponent\" value=\"-1\"/>", "exponent -1 should lie")]);
 }
 
 /// Parts lie above what they are blended to, and what stands around it reaches them.
@@ -82,14 +89,17 @@ fn blends_are_read() {
     assert!(
         blend.parts.iter().all(|&n| n < out.shapes[0].material) && nested.parts.iter().all(|&n| n < blend.parts[1])
     );
-    for (inside, what) in [
-        ("<bsdf type=\"diffuse\"/><bsdf type=\"diffuse\"/>", "lacks its weight"),
-        ("<float name=\"weight\" value=\"0.5\"/><bsdf type=\"diffuse\"/>", "needs two materials inside, and has 1"),
-        ("<float name=\"weight\" value=\"2\"/><bsdf type=\"diffuse\"/><bsdf type=\"diffuse\"/>", "weight 2 should lie"),
-    ] {
-        let told = bad(&format!("<bsdf type=\"blendbsdf\">{inside}</bsdf>"));
-        assert!(told.contains("s.xml:3") && told.contains(what), "{told}");
-    }
+    refused(
+        "blendbsdf",
+        &[
+            ("<bsdf type=\"diffuse\"/><bsdf type=\"diffuse\"/>", "lacks its weight"),
+            ("<float name=\"weight\" value=\"0.5\"/><bsdf type=\"diffuse\"/>", "needs two materials inside, and has 1"),
+            (
+                "<float name=\"weight\" value=\"2\"/><bsdf type=\"diffuse\"/><bsdf type=\"diffuse\"/>",
+                "weight 2 should lie",
+            ),
+        ],
+    );
 }
 
 #[test]
