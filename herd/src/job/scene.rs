@@ -116,7 +116,7 @@ impl PreparedScene {
         let frame = serde_json::to_vec(frame).map_err(|e| JobError::Internal(e.to_string()))?;
         let mut hasher = blake3::Hasher::new();
         // the number changes whenever another picture is made of the same scene and frame: no run goes on with another program's film
-        hasher.update(b"rayherd image 2\0").update(&self.manifest.content.0).update(&frame);
+        hasher.update(b"rayherd image 3\0").update(&self.manifest.content.0).update(&frame);
         Ok(hasher.finalize().to_hex().to_string())
     }
     /// What every path of a frame shares, but for textures.

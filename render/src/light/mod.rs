@@ -1,7 +1,7 @@
 //! Light sources: choosing one, a point on it, and the density with which that happens.
 //!
 //! A source is a primitive that emits, a [beam](crate::world::Beam), or the sky. Sky and parallel light have shares that do not depend on
-//! where they are seen from; so has what is local where it is one shape, or where all there is are at most [`FEW`] triangles. Of more, a [tree]
+//! where they are seen from; so has what is local where it is one shape of at most [`FEW`] primitives. Of more, a [tree]
 //! chooses by the point that is lit. Nine tenths of the shares of shapes and beams go by power (luminance x area x pi), one tenth is dealt
 //! evenly; a primitive of a shape has its share of the area. Within the tree nothing is dealt evenly: these shares only say how often it is asked,
 //! and whoever may shine at the point has one number at least. The probabilities are multiples of 2^-32, intervals of integers, so one 32-bit
@@ -33,6 +33,7 @@ pub use map::{SkyMap, SkyMapError};
 use sky::Sky;
 pub use sphere::SphereLight;
 use tree::Tree;
+pub(crate) use tree::{Node, end};
 pub use triangle::TriangleLight;
 
 /// Share of the choice that is dealt evenly over the sources.
@@ -56,8 +57,16 @@ pub struct Lights {
     sky: Sky,
     sky_probability: f32,
     only_triangles: bool,
-    /// The sources once more, if they are triangles and at most [`FEW`].
+    /// The sources once more, if they are triangles and at most [`FEW`]: in the order of the tree's only node, if there is a tree.
     few: Vec<FewTriangles>,
+}
+
+/// All sources, where they are triangles and few.
+pub(crate) enum Few<'l> {
+    /// Chosen by numbers that are the same everywhere.
+    ByPower(&'l [FewTriangles]),
+    /// Each is a child of the node, in this order.
+    ByPlace(&'l Node, &'l [FewTriangles]),
 }
 
 /// So many sources are chosen from by comparing with each.
@@ -66,11 +75,11 @@ const FEW: usize = 8;
 /// A triangle of those that are all the sources there are.
 #[derive(Clone, Debug)]
 pub(crate) struct FewTriangles {
-    /// Where its interval begins; the next one's begins where it ends.
+    /// Where its interval begins, by power; the next one's begins where it ends.
     pub start: u32,
     pub light: TriangleLight,
     pub radiance: Vec3,
-    /// With which it is chosen.
+    /// With which it is chosen, by power.
     pub probability: f32,
 }
 
@@ -122,24 +131,23 @@ impl Lights {
 
     /// Tables for a world and the picture of its sky, which is dark where the world wants one and there is none.
     pub fn with_sky_map(world: &World, map: Option<Arc<SkyMap>>) -> Lights {
-        // of a few triangles the choice is vector code, and by power: the tree has a fifth less variance there, and takes a third longer
-        Lights::build(world, map, |sources, parts, few| sources > 1 && !few && (parts > 1 || sources > FEW))
+        Lights::build(world, map, |sources, parts| sources > 1 && (parts > 1 || sources > FEW))
     }
 
     /// The plain twin: a choice by power alone.
     #[cfg(test)]
     pub(crate) fn by_power(world: &World, map: Option<Arc<SkyMap>>) -> Lights {
-        Lights::build(world, map, |_, _, _| false)
+        Lights::build(world, map, |_, _| false)
     }
 
     /// With a tree whatever the sources.
     #[cfg(test)]
     pub(crate) fn by_tree(world: &World) -> Lights {
-        Lights::build(world, None, |sources, _, _| sources > 0)
+        Lights::build(world, None, |sources, _| sources > 0)
     }
 
-    /// `wants_tree` is told the number of local sources, of how many shapes and beams they are, and whether all there is are a few triangles.
-    fn build(world: &World, map: Option<Arc<SkyMap>>, wants_tree: impl Fn(usize, usize, bool) -> bool) -> Lights {
+    /// `wants_tree` is told the number of local sources, and of how many shapes and beams they are.
+    fn build(world: &World, map: Option<Arc<SkyMap>>, wants_tree: impl Fn(usize, usize) -> bool) -> Lights {
         let mut sources = Vec::new();
         let mut by_prim = Vec::new();
         let mut areas = vec![0.0f64; world.shapes.len()];
@@ -192,7 +200,7 @@ impl Lights {
         let mut ends = Vec::new();
         let only_triangles = !sources.is_empty() && sources.iter().all(|s| matches!(s.geometry, Geometry::Triangle(_)));
         let is_few = only_triangles && sources.len() <= FEW;
-        if wants_tree(bounds.len(), parts, is_few) {
+        if wants_tree(bounds.len(), parts) {
             in_tree = bounds.len();
             // the tree as one weight, before those that are not in it
             let local: f64 = weights[..in_tree].iter().sum();
@@ -208,7 +216,11 @@ impl Lights {
             start = end;
         }
         let sky_probability = sky.mean().map_or(0.0, |_| sources.last().map_or(0.0, |s| s.probability));
-        let few = if tree.is_none() && is_few { few_triangles(&sources, &ends) } else { Vec::new() };
+        let few = match &tree {
+            _ if !is_few => Vec::new(),
+            None => few_triangles(&sources, &ends),
+            Some(tree) => children(&sources, tree.root()),
+        };
         Lights { sources, tree, ends, in_tree, by_prim, sky, sky_probability, only_triangles, few }
     }
 
@@ -232,7 +244,7 @@ impl Lights {
 
     /// A direction from `o` to a source, by random bits: one number for the choice and two for the place. `None` when what was chosen shows
     /// `o` its back: that sample is worth 0.
-    #[inline]
+    #[inline(always)]
     pub fn sample(&self, o: Vec3, choice: u32, place: [u32; 2]) -> Option<LightSample> {
         self.sample_chosen(self.choose(o, choice)?, o, place)
     }
@@ -275,15 +287,19 @@ impl Lights {
         self.only_triangles
     }
 
-    /// All sources, the first beginning at 0, if they are triangles and few.
+    /// All sources, if they are triangles and few.
     #[inline(always)]
-    pub(crate) fn few_triangles(&self) -> Option<&[FewTriangles]> {
-        (!self.few.is_empty()).then_some(&self.few)
+    pub(crate) fn few_triangles(&self) -> Option<Few<'_>> {
+        match &self.tree {
+            _ if self.few.is_empty() => None,
+            None => Some(Few::ByPower(&self.few)),
+            Some(tree) => Some(Few::ByPlace(tree.root(), &self.few)),
+        }
     }
 
     /// Density of [`Lights::sample`], from `o`, in the direction `d` that met the front of primitive `prim` at distance `t`, where the cosine
     /// between the source's normal and the way back is `cos`. 0 for what is never sampled.
-    #[inline]
+    #[inline(always)]
     pub fn pdf(&self, prim: PrimId, o: Vec3, t: f32, cos: f32) -> f32 {
         let Ok(i) = self.by_prim.binary_search_by_key(&prim, |e| e.0) else { return 0.0 };
         let number = self.by_prim[i].1 as usize;
@@ -300,7 +316,7 @@ impl Lights {
     }
 
     /// The source in whose interval the number lies at the point; `None` where nothing shines there.
-    #[inline]
+    #[inline(always)]
     pub(crate) fn choose(&self, o: Vec3, number: u32) -> Option<Choice> {
         let number = u64::from(number);
         if let Some(tree) = &self.tree
@@ -331,8 +347,8 @@ impl Geometry {
 }
 
 /// Of so many of the 2^32 numbers.
-#[inline]
-fn probability(numbers: u64) -> f32 {
+#[inline(always)]
+pub(crate) fn probability(numbers: u64) -> f32 {
     (numbers as f64 / 4_294_967_296.0) as f32
 }
 
@@ -349,6 +365,16 @@ fn few_triangles(sources: &[Source], ends: &[u64]) -> Vec<FewTriangles> {
         _ => None,
     });
     few.collect()
+}
+
+/// Sources that are triangles, as the children of a node are; nothing if one is not.
+fn children(sources: &[Source], node: &Node) -> Vec<FewTriangles> {
+    let few = (0..node.children()).map(|k| {
+        let source = &sources[node.source(k)? as usize];
+        let Geometry::Triangle(light) = source.geometry else { return None };
+        Some(FewTriangles { start: 0, light, radiance: source.emission, probability: 0.0 })
+    });
+    few.collect::<Option<_>>().unwrap_or_default()
 }
 
 /// The sky's share of the choice: all when it is alone, else by the power that enters the scene's bounding sphere, but at most

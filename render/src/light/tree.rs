@@ -1,92 +1,110 @@
 //! A light tree: which of many local sources, by what may arrive from each at a point (Conty Estevez and Kulla 2018, "Importance Sampling of
 //! Many Lights with Adaptive Tree Splitting"; the measure for points is pbrt-v4's, section 12.6.3).
 //!
-//! A node bounds its sources: a sphere that they lie in, a cone of their normals, the angle beyond which nothing is emitted, and the sum of
-//! their largest intensities. From the root down a number in [0, [`Tree::share`]) is narrowed to an interval for each source: a node's
-//! interval is divided between its children by their importance. All of it is integers but the quotient of two importances, which both
-//! sides of MIS find in the same way from the same point, so a source is chosen with just the probability that it is said to be.
+//! A node has up to eight children, whose importances are found together in vector code, where the caller's code has vectors: so these functions take part in it. A child bounds its sources: a sphere that they lie in, a
+//! cone of their normals, the angle beyond which nothing is emitted, and the sum of their largest intensities. From the root down a number
+//! in [0, [`Tree::share`]) is narrowed to an interval for each source: a node's interval is divided between its children by their importance. All
+//! of it is integers but the quotient of a sum of importances and that of all, which both sides of MIS find in the same way from the same
+//! point, so a source is chosen with just the probability that it is said to be.
 //!
 //! Importance depends on the point alone, not on the normal there: the density has to be found again where a BSDF's ray meets a light, from
 //! what the ray carries, which is its origin. (With the receiver's cosine too, variance was a sixth less and the time a third more.)
 //!
-//! **Nothing is left out wrongly.** Importance is 0 only where the bounds say that no source of the node shines towards the point. The
-//! angles that this is decided by are found from cosines and sines with errors below 8 roundings; an angle is the less certain the nearer
-//! its cosine is to 1, at most sqrt(2 x 8 x 2^-24) < 0.001; three of them make less than [`MARGIN`], by which the limit is moved. The sphere
+//! **Nothing is left out wrongly.** Importance is 0 only where the bounds say that no source of the child shines towards the point. The
+//! angles that this is decided by are found from cosines and sines with errors below 12 roundings; an angle is the less certain the nearer
+//! its cosine is to 1, at most sqrt(2 x 12 x 2^-24) < 0.0012; three of them make less than [`MARGIN`], by which the limit is moved. The sphere
 //! is larger by the rounding of its centre. Whatever is not 0 gets at least as many integers as it has sources, so each of them is chosen sometimes.
 
 use glam::{DVec3, Vec3};
 
 use super::bounds::Bounds;
 
-/// By which the cosine of a direction must be beyond the limit for a node to be dark there; as an angle never less than this.
+/// By which the cosine of a direction must be beyond the limit for a child to be dark there; as an angle never less than this.
 const MARGIN: f64 = 1.0 / 128.0;
 /// Least cosine that counts: so much may reach a point that the bounds call grazing.
 const GRAZING: f32 = 1.0 / 64.0;
-/// Largest importance, so that two of them have a finite sum.
-const LARGEST: f32 = f32::MAX / 4.0;
-/// Parts into which an axis is cut to find where to divide a node.
+/// Children of a node.
+const WIDTH: usize = 8;
+/// Largest importance, so that those of a node have a finite sum.
+const LARGEST: f32 = f32::MAX / 16.0;
+/// Parts into which an axis is cut to find where to divide sources.
 const BINS: usize = 12;
-/// Levels after which nodes are halved by number, which bounds the depth by this and the logarithm of the number of sources.
+/// Levels after which sources are halved by number, which bounds the depth.
 const DEEP: usize = 64;
+/// Most levels: those, and as many as halving 2^32 sources three times a level takes.
+const LEVELS: usize = DEEP + 11;
+/// In a child's reference: it is a source.
+const LEAF: u32 = 1 << 31;
 
-/// A binary tree over sources; each leaf holds one.
+/// A tree over sources.
 #[derive(Clone, Debug)]
 pub(super) struct Tree {
-    /// In depth-first order: the left child follows its parent.
+    /// The root first.
     nodes: Vec<Node>,
-    /// By source: its leaf.
+    /// By node: its place in its parent, as in `leaves`; of the root nothing.
+    parents: Vec<u32>,
+    /// By source: its node times [`WIDTH`] and its place there.
     leaves: Vec<u32>,
     share: u64,
 }
 
-/// What importance is found from.
-#[derive(Clone, Copy, Debug)]
-struct Node {
-    center: Vec3,
-    /// Squared radius of the sphere about `center` that holds the sources.
-    radius2: f32,
-    axis: Vec3,
+/// What the importances of eight children are found from.
+#[derive(Clone, Debug)]
+#[repr(align(32))]
+pub(crate) struct Node {
+    center: [[f32; WIDTH]; 3],
+    /// Of the sphere about `center` that holds the sources.
+    radius: [f32; WIDTH],
+    radius2: [f32; WIDTH],
+    /// 1 / radius2.
+    near: [f32; WIDTH],
+    axis: [[f32; WIDTH]; 3],
     /// Of the cone about `axis` that holds all normals.
-    cos_normals: f32,
-    sin_normals: f32,
+    cos_normals: [f32; WIDTH],
+    sin_normals: [f32; WIDTH],
     /// At or below this cosine, of the angle from the nearest normal, it is dark.
-    dark: f32,
+    dark: [f32; WIDTH],
     /// Sum of the largest intensities; the whole tree's is 1.
-    intensity: f32,
-    /// Sources below.
-    count: u32,
-    /// Place of the right child; 0 for a leaf.
-    right: u32,
-    /// A leaf's source.
-    source: u32,
+    intensity: [f32; WIDTH],
+    /// Sources below; 0 where there is no child.
+    count: [u32; WIDTH],
+    /// A node, or a source and [`LEAF`].
+    child: [u32; WIDTH],
 }
 
 impl Tree {
-    /// A tree over sources, of which there is at least one; numbers below `share` choose.
+    /// A tree over sources, of which there is at least one and fewer than 2^28; numbers below `share` choose.
     pub(super) fn new(sources: &[Bounds], share: u64) -> Tree {
         let total: f64 = sources.iter().map(|s| s.intensity).sum();
-        let mut tree = Tree { nodes: Vec::with_capacity(2 * sources.len()), leaves: vec![0; sources.len()], share };
+        let mut tree = Tree { nodes: Vec::new(), parents: Vec::new(), leaves: vec![0; sources.len()], share };
         let mut order: Vec<u32> = (0..sources.len() as u32).collect();
-        tree.build(sources, total, &mut order, 0);
+        tree.build(sources, total, &mut order, u32::MAX, 0);
         tree
     }
 
-    fn build(&mut self, sources: &[Bounds], total: f64, order: &mut [u32], depth: usize) {
-        let bounds = order.iter().map(|&i| sources[i as usize]).reduce(|a, b| a.union(&b));
-        let Some(bounds) = bounds else { return };
-        let place = self.nodes.len();
-        self.nodes.push(Node::new(&bounds, total, order.len()));
-        if let [source] = *order {
-            self.nodes[place].source = source;
-            self.leaves[source as usize] = place as u32;
-            return;
+    /// Makes the node of some sources, and those below; its number.
+    fn build(&mut self, sources: &[Bounds], total: f64, order: &mut [u32], parent: u32, depth: usize) -> u32 {
+        let number = self.nodes.len();
+        self.nodes.push(Node::EMPTY);
+        self.parents.push(parent);
+        for (slot, (part, bounds)) in parts(sources, order, depth).into_iter().enumerate() {
+            let place = (number * WIDTH + slot) as u32;
+            let child = match *part {
+                [source] => {
+                    self.leaves[source as usize] = place;
+                    source | LEAF
+                }
+                _ => self.build(sources, total, part, place, depth + 1),
+            };
+            self.nodes[number].set(slot, &bounds, total, part.len(), child);
         }
-        let middle = if depth < DEEP { divide(sources, &bounds, order) } else { None };
-        let middle = middle.unwrap_or_else(|| halve(sources, &bounds, order));
-        let (left, right) = order.split_at_mut(middle);
-        self.build(sources, total, left, depth + 1);
-        self.nodes[place].right = self.nodes.len() as u32;
-        self.build(sources, total, right, depth + 1);
+        number as u32
+    }
+
+    /// The root.
+    #[inline(always)]
+    pub(super) fn root(&self) -> &Node {
+        &self.nodes[0]
     }
 
     /// How many numbers choose, of 2^32.
@@ -97,113 +115,187 @@ impl Tree {
 
     /// The source that a number below [`Tree::share`] chooses at a point, and how many numbers choose it there; `None` where the
     /// bounds of what is left show that it does not shine there.
-    #[inline]
+    #[inline(always)]
     pub(super) fn choose(&self, o: Vec3, mut number: u64) -> Option<(usize, u64)> {
         let mut length = self.share;
-        let mut at = 0;
+        let mut node = &self.nodes[0];
         loop {
-            let node = &self.nodes[at];
-            if node.right == 0 {
-                return Some((node.source as usize, length));
+            let ends = node.ends(o, length)?;
+            let slot = ends.iter().filter(|&&end| end <= number).count();
+            let start = if slot == 0 { 0 } else { ends[slot - 1] };
+            (number, length) = (number - start, ends[slot] - start);
+            let child = node.child[slot];
+            if child & LEAF != 0 {
+                return Some(((child ^ LEAF) as usize, length));
             }
-            let left = self.left_part(o, at, node.right as usize, length)?;
-            if number < left {
-                (at, length) = (at + 1, left);
-            } else {
-                number -= left;
-                (at, length) = (node.right as usize, length - left);
-            }
+            node = &self.nodes[child as usize];
         }
     }
 
     /// How many numbers choose a source at a point.
-    #[inline]
+    #[inline(always)]
     pub(super) fn numbers(&self, o: Vec3, source: usize) -> u64 {
-        let leaf = self.leaves[source] as usize;
+        let mut way = [0; LEVELS];
+        let mut place = self.leaves[source];
+        let mut levels = 0;
+        while place != u32::MAX {
+            way[levels] = place;
+            levels += 1;
+            place = self.parents[place as usize / WIDTH];
+        }
         let mut length = self.share;
-        let mut at = 0;
-        while at != leaf {
-            let right = self.nodes[at].right as usize;
-            let Some(left) = self.left_part(o, at, right, length) else { return 0 };
-            (at, length) = if leaf < right { (at + 1, left) } else { (right, length - left) };
+        for &place in way[..levels].iter().rev() {
+            let (node, slot) = (place as usize / WIDTH, place as usize % WIDTH);
+            let Some(ends) = self.nodes[node].ends(o, length) else { return 0 };
+            length = ends[slot] - if slot == 0 { 0 } else { ends[slot - 1] };
             if length == 0 {
                 return 0;
             }
         }
         length
     }
-
-    /// Of `length` numbers those of the left child of the node at `at`; `None` if neither child shines at `o`.
-    #[inline]
-    fn left_part(&self, o: Vec3, at: usize, right: usize, length: u64) -> Option<u64> {
-        let (l, r) = (&self.nodes[at + 1], &self.nodes[right]);
-        let (a, b) = (l.importance(o), r.importance(o));
-        match (a > 0.0, b > 0.0) {
-            (false, false) => None,
-            (false, true) => Some(0),
-            (true, false) => Some(length),
-            (true, true) => {
-                // below 2^32, so the product stays below 2^64
-                let part = ((a / (a + b)) * 4_294_967_296.0) as u64;
-                let left = (length * part.min(u64::from(u32::MAX))) >> 32;
-                Some(left.max(u64::from(l.count)).min(length.saturating_sub(u64::from(r.count))))
-            }
-        }
-    }
 }
 
 impl Node {
-    fn new(bounds: &Bounds, total: f64, count: usize) -> Node {
+    const EMPTY: Node = {
+        let zero = [0.0; WIDTH];
+        Node {
+            center: [zero; 3],
+            radius: zero,
+            radius2: zero,
+            near: zero,
+            axis: [zero; 3],
+            cos_normals: zero,
+            sin_normals: zero,
+            dark: zero,
+            intensity: zero,
+            count: [0; WIDTH],
+            child: [0; WIDTH],
+        }
+    };
+
+    fn set(&mut self, slot: usize, bounds: &Bounds, total: f64, count: usize, child: u32) {
         let center = bounds.center().as_vec3();
         // larger by the centre's rounding and its own
         let off = (bounds.center() - center.as_dvec3()).length();
         let radius = (bounds.radius() + off) * (1.0 + 1e-6);
+        let axis = bounds.axis.as_vec3();
+        for k in 0..3 {
+            (self.center[k][slot], self.axis[k][slot]) = (center[k], axis[k]);
+        }
+        self.radius[slot] = radius as f32;
+        self.radius2[slot] = (radius * radius) as f32;
+        self.near[slot] = 1.0 / self.radius2[slot];
         let angle = bounds.normals.min(std::f64::consts::PI);
-        let dark = libm::cos(bounds.emission.min(std::f64::consts::PI)) - MARGIN;
-        Node {
-            center,
-            radius2: (radius * radius) as f32,
-            axis: bounds.axis.as_vec3(),
-            cos_normals: libm::cos(angle) as f32,
-            sin_normals: libm::sin(angle) as f32,
-            dark: dark as f32,
-            intensity: (bounds.intensity / total) as f32,
-            count: count as u32,
-            right: 0,
-            source: 0,
-        }
+        (self.cos_normals[slot], self.sin_normals[slot]) = (libm::cos(angle) as f32, libm::sin(angle) as f32);
+        self.dark[slot] = (libm::cos(bounds.emission.min(std::f64::consts::PI)) - MARGIN) as f32;
+        self.intensity[slot] = (bounds.intensity / total) as f32;
+        (self.count[slot], self.child[slot]) = (count as u32, child);
     }
 
-    /// What may arrive at `o` on a surface that faces it, roughly; 0 only if nothing does.
-    #[inline]
-    #[expect(clippy::manual_clamp, reason = "clamp leaves NaN as it is")]
-    fn importance(&self, o: Vec3) -> f32 {
-        let to = o - self.center;
-        let d2 = to.length_squared();
-        let cos = if d2 > self.radius2 { self.largest_cos(to, d2) } else { 1.0 };
-        if cos <= self.dark {
-            return 0.0;
-        }
-        let importance = self.intensity * cos.max(GRAZING) / d2.max(self.radius2);
-        // NaN too becomes a number: a point that is none chooses something
-        importance.max(f32::MIN_POSITIVE).min(LARGEST)
+    /// How many children it has: the first ones.
+    #[inline(always)]
+    pub(crate) fn children(&self) -> usize {
+        self.count.iter().filter(|&&n| n > 0).count()
     }
 
-    /// Of the angle between any normal and the way from its source to a point beyond the sphere at `to` from the centre: the largest cosine.
-    #[inline]
-    fn largest_cos(&self, to: Vec3, d2: f32) -> f32 {
-        let cos = (self.axis.dot(to) / d2.sqrt()).clamp(-1.0, 1.0);
+    /// The source that a child is.
+    pub(super) fn source(&self, k: usize) -> Option<u32> {
+        (self.count[k] == 1).then_some(self.child[k] ^ LEAF)
+    }
+
+    /// What may arrive at `o` from child `k` on a surface that faces it, roughly; 0 only if nothing does, or there is no child.
+    #[inline(always)]
+    pub(crate) fn importance(&self, k: usize, o: Vec3) -> f32 {
+        let [x, y, z] = [o.x - self.center[0][k], o.y - self.center[1][k], o.z - self.center[2][k]];
+        let d2 = x * x + y * y + z * z;
+        let far = 1.0 / d2;
+        let distance = far.sqrt();
+        // of the angle between any normal and the way from its source: the largest cosine
+        let cos = (self.axis[0][k] * x + self.axis[1][k] * y + self.axis[2][k] * z) * distance;
+        let cos = if cos < 1.0 { cos } else { 1.0 };
+        let cos = if cos > -1.0 { cos } else { -1.0 };
         let sin = (1.0 - cos * cos).sqrt();
-        let sphere = self.radius2 / d2;
-        let (cos, sin) = less((cos, sin), (self.cos_normals, self.sin_normals));
-        less((cos, sin), ((1.0 - sphere).max(0.0).sqrt(), sphere.sqrt())).0
+        let (cos, sin) = less((cos, sin), (self.cos_normals[k], self.sin_normals[k]));
+        let of_sphere = self.radius[k] * distance;
+        let beside = 1.0 - of_sphere * of_sphere;
+        let beside = if beside > 0.0 { beside.sqrt() } else { 0.0 };
+        let (cos, _) = less((cos, sin), (beside, of_sphere));
+        let is_beyond = d2 > self.radius2[k];
+        let cos = if is_beyond { cos } else { 1.0 };
+        let strength = self.intensity[k] * if is_beyond { far } else { self.near[k] };
+        let importance = strength * if cos > GRAZING { cos } else { GRAZING };
+        // NaN too becomes a number: a point that is none chooses something
+        let importance = if importance > f32::MIN_POSITIVE { importance } else { f32::MIN_POSITIVE };
+        let importance = if importance < LARGEST { importance } else { LARGEST };
+        if cos <= self.dark[k] || self.count[k] == 0 { 0.0 } else { importance }
+    }
+
+    /// Where the children's intervals of [0, `length`) end; `None` if no child shines at `o`.
+    #[inline(always)]
+    fn ends(&self, o: Vec3, length: u64) -> Option<[u64; WIDTH]> {
+        let mut importances = [0.0; WIDTH];
+        for k in 0..WIDTH {
+            importances[k] = self.importance(k, o);
+        }
+        let (mut sums, mut counts) = ([0.0; WIDTH], [0; WIDTH]);
+        let (mut sum, mut count) = (0.0, 0);
+        for k in 0..WIDTH {
+            sum += importances[k];
+            count += if importances[k] > 0.0 { self.count[k] } else { 0 };
+            (sums[k], counts[k]) = (sum, count);
+        }
+        if count == 0 {
+            return None;
+        }
+        let mut ends = [0; WIDTH];
+        for k in 0..WIDTH {
+            ends[k] = end((sums[k], sum), (counts[k], count), length);
+        }
+        Some(ends)
     }
 }
 
+/// Where an interval of [0, `length`) ends: importance up to there and of all, sources that shine up to there and all.
+#[inline(always)]
+pub(crate) fn end((part, all): (f32, f32), (before, count): (u32, u32), length: u64) -> u64 {
+    // each source has one number for sure; what is dealt out is below 2^32, as there is one
+    let free = length.saturating_sub(u64::from(count));
+    let end = u64::from(before) + ((free * u64::from((part / all * BELOW_2_32) as u32)) >> 32);
+    // the last that shines ends it, whatever was rounded
+    if before < count && end < length { end } else { length }
+}
+
+/// The largest f32 below 2^32.
+const BELOW_2_32: f32 = 4_294_967_040.0;
+
 /// Cosine and sine of the difference of two angles in [0, pi], or of 0 where the second is larger.
-#[inline]
+#[inline(always)]
 fn less(a: (f32, f32), b: (f32, f32)) -> (f32, f32) {
-    if a.0 > b.0 { (1.0, 0.0) } else { (a.0 * b.0 + a.1 * b.1, a.1 * b.0 - a.0 * b.1) }
+    let is_within = a.0 > b.0;
+    let (cos, sin) = (a.0 * b.0 + a.1 * b.1, a.1 * b.0 - a.0 * b.1);
+    (if is_within { 1.0 } else { cos }, if is_within { 0.0 } else { sin })
+}
+
+/// Sorts sources into at most [`WIDTH`] parts with their bounds: what costs most is divided first.
+fn parts<'o>(sources: &[Bounds], order: &'o mut [u32], depth: usize) -> Vec<(&'o mut [u32], Bounds)> {
+    let bounds = |part: &[u32]| part.iter().map(|&i| sources[i as usize]).reduce(|a, b| a.union(&b));
+    let mut out: Vec<(&mut [u32], Bounds)> = Vec::with_capacity(WIDTH);
+    out.extend(bounds(order).map(|b| (order, b)));
+    while out.len() < WIDTH {
+        // of equal costs, as those of points in one place, the most sources
+        let dear = |a: &(&mut [u32], Bounds), b: &(&mut [u32], Bounds)| {
+            a.1.cost().total_cmp(&b.1.cost()).then(a.0.len().cmp(&b.0.len()))
+        };
+        let divisible = out.iter().enumerate().filter(|(_, p)| p.0.len() > 1);
+        let Some((n, _)) = divisible.max_by(|a, b| dear(a.1, b.1)) else { break };
+        let (part, whole) = out.swap_remove(n);
+        let middle = if depth < DEEP { divide(sources, &whole, part) } else { None };
+        let middle = middle.unwrap_or_else(|| halve(sources, &whole, part));
+        let (left, right) = part.split_at_mut(middle);
+        out.extend([left, right].into_iter().filter_map(|part| bounds(part).map(|b| (part, b))));
+    }
+    out
 }
 
 /// Sorts sources into two parts of least cost (the surface area orientation heuristic, with the squared diagonal for the area, which tells

@@ -9,7 +9,7 @@ use glam::Vec3;
 use super::diffuse::{Fate, cosine_direction, onwards, snap, towards_light};
 use super::interaction::Flat;
 use super::{Context, Outcome, PathRay, ShadowRay, wide};
-use crate::light::{Choice, FewTriangles, TriangleLight};
+use crate::light::{Choice, Few, FewTriangles, Node, TriangleLight, end, probability};
 use crate::math::{UnitDir, offset_origin, unit};
 use crate::ray::{PathKey, Ray};
 use crate::sampler::{BSDF, LIGHT, LIGHT_CHOICE, ROULETTE, Streams};
@@ -104,6 +104,14 @@ pub(super) struct Block {
     next_throughput: Lanes3,
     next_pdf: Lanes,
     fate: [Fate; N],
+}
+
+/// Sets the lanes where the mask's bits are 1.
+#[inline(always)]
+fn set(lanes: &mut Lanes, x: f32, mask: &[u32; N]) {
+    for i in 0..N {
+        lanes[i] = f32::from_bits((x.to_bits() & mask[i]) | (lanes[i].to_bits() & !mask[i]));
+    }
 }
 
 impl Default for Block {
@@ -259,8 +267,10 @@ impl Block {
 
     #[inline(always)]
     fn choose_lights(&mut self, context: &Context) {
-        if let Some(few) = context.lights.few_triangles() {
-            return self.choose_of_few(few);
+        match context.lights.few_triangles() {
+            Some(Few::ByPower(few)) => return self.choose_by_power(few),
+            Some(Few::ByPlace(node, few)) => return self.choose_by_place(node, few),
+            None => {}
         }
         for i in 0..self.len {
             // where a vertex passes there is no point to choose for
@@ -281,33 +291,69 @@ impl Block {
 
     /// By comparing each number with each source: the last whose interval begins at or before it.
     #[inline(always)]
-    fn choose_of_few(&mut self, few: &[FewTriangles]) {
-        for FewTriangles { start, light, radiance, probability } in few {
+    fn choose_by_power(&mut self, few: &[FewTriangles]) {
+        for light in few {
             // bits all 1 where it is chosen: a select of floats would be unrolled into branches
             let mut mask = [0; N];
             for i in 0..N {
-                mask[i] = if self.choice[i] >= *start { u32::MAX } else { 0 };
+                mask[i] = if self.choice[i] >= light.start { u32::MAX } else { 0 };
             }
-            let set = |lanes: &mut Lanes, x: f32| {
-                for i in 0..N {
-                    lanes[i] = f32::from_bits((x.to_bits() & mask[i]) | (lanes[i].to_bits() & !mask[i]));
-                }
-            };
-            for (lanes, v) in [
-                (&mut self.light_p0, light.p0),
-                (&mut self.light_e1, light.e1),
-                (&mut self.light_e2, light.e2),
-                (&mut self.light_normal, light.normal),
-                (&mut self.radiance, *radiance),
-            ] {
-                set(&mut lanes.0[0], v.x);
-                set(&mut lanes.0[1], v.y);
-                set(&mut lanes.0[2], v.z);
-            }
-            set(&mut self.light_area, light.area);
-            set(&mut self.light_error, light.error);
-            set(&mut self.probability, *probability);
+            self.take(light, &mask);
+            set(&mut self.probability, light.probability, &mask);
         }
+    }
+
+    /// As [`crate::light::Lights::choose`] does in the tree's only node: by the interval in which each number lies.
+    #[inline(always)]
+    fn choose_by_place(&mut self, node: &Node, few: &[FewTriangles]) {
+        const MOST: usize = 8;
+        let few = &few[..few.len().min(MOST)];
+        let (mut sums, mut counts) = ([[0.0; N]; MOST], [[0; N]; MOST]);
+        let (mut all, mut count) = ([0.0; N], [0; N]);
+        for k in 0..few.len() {
+            for i in 0..N {
+                let importance = node.importance(k, self.origin.get(i));
+                all[i] += importance;
+                count[i] += u32::from(importance > 0.0);
+                (sums[k][i], counts[k][i]) = (all[i], count[i]);
+            }
+        }
+        let (mut begin, mut numbers) = ([0; N], [0; N]);
+        for (k, light) in few.iter().enumerate() {
+            let mut mask = [0; N];
+            for i in 0..N {
+                // where none shines there are no numbers to choose by
+                let length = if count[i] > 0 { 1 << 32 } else { 0 };
+                let end = end((sums[k][i], all[i]), (counts[k][i], count[i]), length);
+                let number = u64::from(self.choice[i]);
+                let is_chosen = (number >= begin[i]) & (number < end);
+                numbers[i] = if is_chosen { end - begin[i] } else { numbers[i] };
+                mask[i] = if is_chosen { u32::MAX } else { 0 };
+                begin[i] = end;
+            }
+            self.take(light, &mask);
+        }
+        for i in 0..N {
+            self.probability[i] = probability(numbers[i]);
+        }
+    }
+
+    /// Takes a light where the mask's bits are 1.
+    #[inline(always)]
+    fn take(&mut self, FewTriangles { light, radiance, .. }: &FewTriangles, mask: &[u32; N]) {
+        for (lanes, v) in [
+            (&mut self.light_p0, light.p0),
+            (&mut self.light_e1, light.e1),
+            (&mut self.light_e2, light.e2),
+            (&mut self.light_normal, light.normal),
+            (&mut self.radiance, *radiance),
+        ] {
+            for (lanes, x) in lanes.0.iter_mut().zip(v.to_array()) {
+                set(lanes, x, mask);
+            }
+        }
+        set(&mut self.light_area, light.area, mask);
+        set(&mut self.light_error, light.error, mask);
     }
 
     #[inline(always)]
@@ -325,7 +371,7 @@ impl Block {
             self.light_d.set(i, d);
             self.light_tmax[i] = tmax;
             self.light_pdf[i] = pdf * self.probability[i];
-            self.lit[i] = ok;
+            self.lit[i] = ok & (self.probability[i] > 0.0);
         }
     }
 

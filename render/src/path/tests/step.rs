@@ -103,10 +103,22 @@ fn motley() -> Scene {
     scene
 }
 
+/// The Cornell box with more lamps, that face this way and that.
+fn lamps(more: u32) -> Scene {
+    let mut scene = cornell::scene();
+    let white = scene.diffuse(0.8);
+    for i in 0..more {
+        let lamp = scene.shape(white, Some([1.0 + i as f32; 3]));
+        let at = [0.15 * i as f32 - 0.6, 0.1 * i as f32 - 0.5, 0.3];
+        scene.quad(lamp, at, [0.1, 0.0, 0.0], [[0.0, 0.0, 0.1], [0.0, 0.1, 0.0], [0.0, 0.0, -0.1]][i as usize % 3]);
+    }
+    scene
+}
+
 /// Every ray alone, and the plain way, gives what the batch gives; also in another order.
 #[test]
 fn batches_do_not_matter() {
-    for (scene, split) in [(cornell::scene(), 1), (motley(), 3)] {
+    for (scene, split) in [(cornell::scene(), 1), (lamps(3), 2), (lamps(9), 1), (motley(), 3)] {
         check_batches(&scene, split);
     }
 }
