@@ -37,6 +37,8 @@ pub(super) struct Tree {
     /// By source: its leaf.
     leaves: Vec<u32>,
     share: u64,
+    /// Importance of what is dark: 0, by which it is left out.
+    of_dark: f32,
 }
 
 /// What importance is found from.
@@ -65,7 +67,8 @@ impl Tree {
     /// A tree over sources, of which there is at least one; numbers below `share` choose.
     pub(super) fn new(sources: &[Bounds], share: u64) -> Tree {
         let total: f64 = sources.iter().map(|s| s.intensity).sum();
-        let mut tree = Tree { nodes: Vec::with_capacity(2 * sources.len()), leaves: vec![0; sources.len()], share };
+        let mut tree =
+            Tree { nodes: Vec::with_capacity(2 * sources.len()), leaves: vec![0; sources.len()], share, of_dark: 0.0 };
         let mut order: Vec<u32> = (0..sources.len() as u32).collect();
         tree.build(sources, total, &mut order, 0);
         tree
@@ -95,18 +98,26 @@ impl Tree {
         self.share
     }
 
+    /// Leaves nothing out that is dark at a point: it is chosen as little as may be.
+    pub(super) fn leave_out_none(&mut self) {
+        self.of_dark = f32::MIN_POSITIVE;
+    }
+
     /// The source that a number below [`Tree::share`] chooses at a point, and how many numbers choose it there; `None` where the
-    /// bounds of what is left show that it does not shine there.
+    /// bounds of what is left show that it does not shine there. And whether sources were left out.
     #[inline]
-    pub(super) fn choose(&self, o: Vec3, mut number: u64) -> Option<(usize, u64)> {
+    pub(super) fn choose(&self, o: Vec3, mut number: u64) -> (Option<(usize, u64)>, bool) {
         let mut length = self.share;
         let mut at = 0;
+        let mut fewer = false;
         loop {
             let node = &self.nodes[at];
             if node.right == 0 {
-                return Some((node.source as usize, length));
+                return (Some((node.source as usize, length)), fewer);
             }
-            let left = self.left_part(o, at, node.right as usize, length)?;
+            let Some(left) = self.left_part(o, at, node.right as usize, length) else { return (None, true) };
+            // both have a number at least where both shine
+            fewer |= (left == 0) | (left == length);
             if number < left {
                 (at, length) = (at + 1, left);
             } else {
@@ -137,7 +148,7 @@ impl Tree {
     #[inline]
     fn left_part(&self, o: Vec3, at: usize, right: usize, length: u64) -> Option<u64> {
         let (l, r) = (&self.nodes[at + 1], &self.nodes[right]);
-        let (a, b) = (l.importance(o), r.importance(o));
+        let (a, b) = (l.importance(o, self.of_dark), r.importance(o, self.of_dark));
         match (a > 0.0, b > 0.0) {
             (false, false) => None,
             (false, true) => Some(0),
@@ -174,15 +185,15 @@ impl Node {
         }
     }
 
-    /// What may arrive at `o` on a surface that faces it, roughly; 0 only if nothing does.
+    /// What may arrive at `o` on a surface that faces it, roughly; `of_dark` only if nothing does.
     #[inline]
     #[expect(clippy::manual_clamp, reason = "clamp leaves NaN as it is")]
-    fn importance(&self, o: Vec3) -> f32 {
+    fn importance(&self, o: Vec3, of_dark: f32) -> f32 {
         let to = o - self.center;
         let d2 = to.length_squared();
         let cos = if d2 > self.radius2 { self.largest_cos(to, d2) } else { 1.0 };
         if cos <= self.dark {
-            return 0.0;
+            return of_dark;
         }
         let importance = self.intensity * cos.max(GRAZING) / d2.max(self.radius2);
         // NaN too becomes a number: a point that is none chooses something
