@@ -14,6 +14,7 @@ mod options;
 mod output;
 mod progress;
 mod run_options;
+mod skip_options;
 mod source;
 mod store;
 

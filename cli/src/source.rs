@@ -6,6 +6,7 @@ use anyhow::Context;
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressState, ProgressStyle};
 use rayherd_api::RenderJobSpec;
 use rayherd_herd::job::spec::{import_options, prepare_settings};
+use rayherd_render::skip::Skips;
 use rayherd_scene::import::{DescriptionSource, StreamOptions, import};
 use rayherd_scene::objects::ObjectStore;
 use rayherd_scene::prepare::{PrepareProgress, Prepared, SpoolSettings, Stage, prepare, source_files};
@@ -14,9 +15,24 @@ use crate::log::bars;
 use crate::output::distinct;
 use crate::progress::si;
 
-/// Imports and prepares the scene of a job that was checked; also how many bytes of vertices went to temporary files. Refuses when one of
-/// `outputs`, which are to be written, is a file of the scene.
-pub fn open(spec: &RenderJobSpec, objects: &dyn ObjectStore, outputs: &[PathBuf]) -> anyhow::Result<(Prepared, u64)> {
+/// A scene that was imported and prepared.
+pub struct Opened {
+    /// The scene.
+    pub prepared: Prepared,
+    /// Bytes of vertices that went to temporary files.
+    pub vertices_spilled: u64,
+    /// Cells of volumes that were not looked into.
+    pub cells_passed: u64,
+}
+
+/// Imports and prepares the scene of a job that was checked. Refuses when one of `outputs`, which are to be written, is a file of the
+/// scene.
+pub fn open(
+    spec: &RenderJobSpec,
+    objects: &dyn ObjectStore,
+    outputs: &[PathBuf],
+    skips: Skips,
+) -> anyhow::Result<Opened> {
     let scene = Path::new(&spec.scene.source);
     distinct::check_inputs(outputs, [scene])?;
     let description = import(scene, &import_options(spec))?;
@@ -24,13 +40,13 @@ pub fn open(spec: &RenderJobSpec, objects: &dyn ObjectStore, outputs: &[PathBuf]
     for s in &description.substitutions {
         tracing::warn!("{}: {} is not supported; in its place: {}", s.place, s.what, s.stand_in);
     }
-    let source = DescriptionSource::new(&description, StreamOptions::default());
+    let source = DescriptionSource::new(&description, StreamOptions { skips, ..StreamOptions::default() });
     let progress = StageBar::new();
-    let prepared =
-        prepare(&description, &source, &prepare_settings(spec), &SpoolSettings::default(), objects, &progress);
+    let spool = SpoolSettings { skips, ..SpoolSettings::default() };
+    let prepared = prepare(&description, &source, &prepare_settings(spec), &spool, objects, &progress);
     progress.finish();
     let prepared = prepared.with_context(|| format!("cannot prepare {}", spec.scene.source))?;
-    Ok((prepared, source.spilled_bytes()))
+    Ok(Opened { prepared, vertices_spilled: source.spilled_bytes(), cells_passed: source.cells_passed() })
 }
 
 /// Shows the stages of preparing on a terminal.

@@ -2,6 +2,7 @@
 
 use rayherd_render::path::{PathRay, ShadowRay};
 use rayherd_render::ray::{PrimId, Ray};
+use rayherd_render::skip::{Skip, Skips};
 use rayherd_scene::grid::{Grid, Progress, SplitSet};
 
 /// The nearest hit that a ray found so far.
@@ -45,8 +46,8 @@ impl Visit {
     pub const DECIDED: Visit = Visit { progress: Progress::START, owner: u16::MAX };
 
     /// Where a ray goes next that was tested against `resident`: the split, and how far it will be then. None when
-    /// nothing outside can be hit at or before `ray.tmax`.
-    pub fn next(self, grid: &Grid, ray: &Ray, resident: &SplitSet) -> Option<(u32, Visit)> {
+    /// nothing outside can be hit at or before `ray.tmax`. `missed` as in [`Grid::next_foreign_counted`].
+    pub fn next(self, grid: &Grid, ray: &Ray, resident: &SplitSet, missed: &mut u64) -> Option<(u32, Visit)> {
         if self == Visit::DECIDED {
             return None;
         }
@@ -59,7 +60,7 @@ impl Visit {
         {
             return Some((split, Visit { progress: self.progress, owner }));
         }
-        let cell = grid.next_foreign(ray, self.progress, resident)?;
+        let cell = grid.next_foreign_counted(ray, self.progress, resident, missed)?;
         let (split, owner) = foreign(cell.owners, 0)?;
         Some((split, Visit { progress: cell.progress, owner }))
     }
@@ -80,6 +81,12 @@ impl PathFlight {
     /// A ray that was just made.
     pub fn new(ray: PathRay) -> Self {
         PathFlight { ray, candidate: Candidate::NONE, visit: Visit::START }
+    }
+
+    /// For kernel and grid: no farther than the hit that it has, if that is a reason not to look.
+    pub fn bounded(&self, skips: Skips) -> Ray {
+        let tmax = if skips.makes(Skip::Beaten) { self.candidate.t } else { f32::INFINITY };
+        Ray { tmax, ..self.ray.ray() }
     }
 }
 

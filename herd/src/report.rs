@@ -213,6 +213,8 @@ pub struct Report {
     pub nodes_detail: Vec<NodeReport>,
     /// Primitives that were skipped, by why.
     pub skipped: BTreeMap<String, u64>,
+    /// What was not done because the scene does not need it, by the names of [`rayherd_render::skip::Skip`]: by committed tasks of this run.
+    pub skips: BTreeMap<String, u64>,
 }
 
 impl Report {

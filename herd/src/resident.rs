@@ -91,6 +91,10 @@ impl Resident {
     pub fn split_of(&self, slot: u32) -> u32 {
         self.blocks[self.block_of(slot)].1
     }
+    /// Whether its attributes are in memory.
+    pub fn has_attributes(&self) -> bool {
+        self.attributes.get().is_some()
+    }
     /// To be shaded: reads the attributes when they are asked for first.
     ///
     /// # Errors

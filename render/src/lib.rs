@@ -18,6 +18,7 @@ pub mod math;
 pub mod path;
 pub mod ray;
 pub mod sampler;
+pub mod skip;
 #[cfg(test)]
 mod testing;
 pub mod texture;

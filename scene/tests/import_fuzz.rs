@@ -41,7 +41,7 @@ fn read(path: &Path, substitute: bool) -> Result<usize, ImportError> {
     let options = ImportOptions { substitute, ..ImportOptions::default() };
     let description = import(path, &options)?;
     sky_map(description.environment.as_ref())?;
-    let stream_options = StreamOptions { vertex_budget: 1 << 16, spill_limit: 1 << 20, spill_folder: None };
+    let stream_options = StreamOptions { vertex_budget: 1 << 16, spill_limit: 1 << 20, ..StreamOptions::default() };
     let source = DescriptionSource::new(&description, stream_options);
     let mut stream = source.open()?;
     let (mut records, mut n) = (vec![], 0);

@@ -59,7 +59,7 @@ fn child() {
     let description = import(&folder.join("v.nrrd"), &options).unwrap();
     let source = DescriptionSource::new(&description, StreamOptions::default());
     let settings = PrepareSettings { cut: Cut::BlockSize(BLOCK), ..PrepareSettings::default() };
-    let spool = SpoolSettings { memory: 4 * MIB, folder: Some(folder.into()) };
+    let spool = SpoolSettings { memory: 4 * MIB, folder: Some(folder.into()), ..SpoolSettings::default() };
     let store = DirectoryObjects::open(folder.join("store")).unwrap();
     let prepared = threads.install(|| prepare(&description, &source, &settings, &spool, &store, &NoProgress)).unwrap();
     let manifest = &prepared.manifest;

@@ -4,6 +4,7 @@ use std::process::ExitCode;
 
 use clap::Args;
 use rayherd_api::{ImageSize, RenderJob, RenderJobSpec, Strategy};
+use rayherd_render::skip::Skips;
 
 use super::{print, size};
 use crate::options::{self, CutOptions, SceneOptions};
@@ -46,7 +47,7 @@ pub fn run(arguments: &Arguments) -> anyhow::Result<ExitCode> {
     options::check(&RenderJob::new(spec.clone()), None)?;
 
     let store = Store::open(&arguments.store, &arguments.s3)?;
-    let (prepared, _) = source::open(&spec, store.objects.as_ref(), &[])?;
+    let prepared = source::open(&spec, store.objects.as_ref(), &[], Skips::ALL)?.prepared;
     let m = &prepared.manifest;
     let copied = m.splits.iter().filter(|s| s.copied).count();
     let done = if prepared.reused { "was prepared already: nothing to do" } else { "is prepared" };

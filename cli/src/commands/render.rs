@@ -12,6 +12,7 @@ use rayherd_herd::job::{Commits, JobSettings, PreparedScene, Sampling};
 use rayherd_herd::local::{JobOutcome, render_local};
 use rayherd_herd::picture;
 use rayherd_herd::report::{Kind, Op, Report};
+use rayherd_render::skip::Skip;
 use rayherd_scene::prepare::{ByteKind, ByteOp, ByteRow, Prepared};
 use serde_json::json;
 
@@ -25,7 +26,8 @@ use crate::options::{self, CutOptions, SceneOptions, set};
 use crate::output::{distinct, png_file, replace};
 use crate::progress::{Display, si};
 use crate::run_options::RunOptions;
-use crate::source;
+use crate::skip_options::SkipOptions;
+use crate::source::{self, Opened};
 use crate::store::{S3Options, Store, Temporary};
 
 /// Objects of the prepared scene that stay in memory; what is more goes to a temporary folder.
@@ -73,6 +75,8 @@ pub struct Arguments {
     run: RunOptions,
     #[command(flatten)]
     keep: KeepOptions,
+    #[command(flatten)]
+    skip: SkipOptions,
 }
 
 /// Where the job is kept.
@@ -133,9 +137,11 @@ pub fn run(arguments: &Arguments) -> anyhow::Result<ExitCode> {
     let temporary = if store.is_none() { Some(Temporary::new(OBJECTS_IN_MEMORY)?) } else { None };
     let objects = store.as_ref().map(|s| s.objects.clone()).or_else(|| temporary.as_ref().map(|t| t.objects.clone()));
     let objects = objects.context("no place for the prepared scene")?;
-    let (prepared, vertices_spilled) = source::open(&job.spec, objects.as_ref(), &outputs)?;
+    let skips = arguments.skip.skips();
+    let Opened { prepared, vertices_spilled, cells_passed } =
+        source::open(&job.spec, objects.as_ref(), &outputs, skips)?;
     let shots = frames::shots(&job, &prepared.manifest)?;
-    let scene = PreparedScene::open(prepared.manifest.clone(), objects)?;
+    let scene = PreparedScene::open(prepared.manifest.clone(), objects)?.skipping(skips);
     let sampling = Sampling {
         spp: spec::samples(&job.spec, &prepared.manifest),
         target_error: job.spec.sampling.target_error,
@@ -161,6 +167,9 @@ pub fn run(arguments: &Arguments) -> anyhow::Result<ExitCode> {
         let mut outcome = render(&scene, shot, &sampling, &settings, (preview, exposure))?;
         outcome.report.prepare = prepare_report(&prepared);
         outcome.report.spilled_bytes += vertices_spilled + temporary.as_ref().map_or(0, Temporary::spilled);
+        for (skip, count) in [(Skip::Prepared, prepared.kept()), (Skip::Volume, cells_passed)] {
+            outcome.report.skips.insert(skip.name().to_owned(), count);
+        }
         outcome.report.add_prepare_bytes(prepared.report.bytes.iter().map(prepare_row));
         let saved = save(&scene, shot, &outcome, exposure);
         match &keep.store {
@@ -200,6 +209,7 @@ fn job(arguments: &Arguments) -> anyhow::Result<RenderJob> {
     arguments.cut.apply(spec);
     arguments.image.apply(spec);
     arguments.run.apply(spec);
+    arguments.skip.apply(spec);
     set(&mut spec.sampling.spp, arguments.sampling.spp);
     set(&mut spec.sampling.target_error, arguments.sampling.target_error);
     set(&mut spec.sampling.time_limit, arguments.sampling.time_limit);
@@ -246,7 +256,11 @@ fn render(
 }
 
 fn save(scene: &PreparedScene, shot: &Shot, outcome: &JobOutcome, exposure: f64) -> anyhow::Result<()> {
-    let definition = spec::definition(&scene.manifest, &shot.frame, outcome.spp)?;
+    let mut definition = spec::definition(&scene.manifest, &shot.frame, outcome.spp)?;
+    if !scene.skips().makes(Skip::Lights) {
+        // the frame says nothing of it
+        definition.insert("no_skip".to_owned(), json!([Skip::Lights.name()]));
+    }
     replace::replace_or_keep(&shot.exr, &picture::encode(&outcome.image, &definition)?)?;
     replace::replace_or_keep(&shot.png(), &png_file::encode(&outcome.image, exposure)?)
 }

@@ -12,6 +12,7 @@ use rayherd_render::bvh::{Kernel, Tracer};
 use rayherd_render::film::FilmPart;
 use rayherd_render::path::{Outcome, PathRay, ShadowRay, Surfaces, camera_ray, shade};
 use rayherd_render::ray::Hit;
+use rayherd_render::skip::Skips;
 
 use super::print;
 use super::render::OBJECTS_IN_MEMORY;
@@ -52,7 +53,7 @@ pub fn run(arguments: &Arguments) -> anyhow::Result<ExitCode> {
     options::check(&job, None)?;
     let temporary = Temporary::new(OBJECTS_IN_MEMORY)?;
     let objects = temporary.objects.clone();
-    let (prepared, _) = source::open(&job.spec, objects.as_ref(), &[])?;
+    let prepared = source::open(&job.spec, objects.as_ref(), &[], Skips::ALL)?.prepared;
     let frame = frames::frame(&job, &prepared.manifest, job.spec.image.cameras.first())?;
     let ([x, y], [width, height]) = (arguments.pixel, frame.size);
     if x >= width || y >= height {

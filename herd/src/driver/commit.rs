@@ -78,6 +78,7 @@ impl<F: FilmSum> Driver<'_, '_, F> {
         let bytes = record.made.groups.iter().map(|g| g.bytes).sum::<u64>();
         self.traffic.add(made_rays.camera, made_rays.closest + made_rays.shadow, self.parts, made.hops, bytes);
         self.hops += made.hops;
+        self.skipped += &made.skipped;
         self.hop_bytes += bytes;
         if let Some(film) = record.made.film {
             if self.is_durable() {

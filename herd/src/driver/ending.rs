@@ -1,5 +1,9 @@
 //! What is told while the job runs and at its end.
 
+use std::collections::BTreeMap;
+
+use rayherd_render::skip::Skip;
+
 use super::{Driver, FilmSum};
 use crate::job::{JobError, Status};
 use crate::local::usage;
@@ -70,6 +74,25 @@ impl<F: FilmSum> Driver<'_, '_, F> {
             ..Report::default()
         };
         report.set_bytes(&bytes);
+        report.skips = self.skips();
         Ok((self.film, spp, report))
+    }
+
+    /// What committed tasks of this run left out; what is not known here is missing.
+    fn skips(&self) -> BTreeMap<String, u64> {
+        let mut skips = BTreeMap::from(self.skipped);
+        // known to whoever prepared the scene
+        skips.retain(|name, _| ![Skip::Prepared, Skip::Volume].map(Skip::name).contains(&name.as_str()));
+        for (skip, count) in [Skip::Splits, Skip::Textures].into_iter().zip(self.never_read()) {
+            match count {
+                Some(count) => skips.insert(skip.name().to_owned(), count),
+                None => skips.remove(skip.name()),
+            };
+        }
+        skips
+    }
+
+    fn never_read(&self) -> [Option<u64>; 2] {
+        self.shared.nodes.never_read().map_or([None; 2], |counts| counts.map(Some))
     }
 }

@@ -16,6 +16,8 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
+use rayherd_render::skip::SkipCounts;
+
 use crate::job::{JobError, Progress, Sampling};
 use crate::ledger::{Ledger, Snapshot, TaskId};
 use crate::local::attempt::{Attempt, Shared};
@@ -104,6 +106,7 @@ pub struct Driver<'s, 'a, F> {
     redone: u64,
     hops: u64,
     hop_bytes: u64,
+    skipped: SkipCounts,
     error: Option<f64>,
     /// When the error that is shown is found again.
     next_error: Instant,
@@ -153,6 +156,7 @@ impl<'s, 'a, F: FilmSum> Driver<'s, 'a, F> {
             tasks: 0,
             hops: 0,
             hop_bytes: 0,
+            skipped: SkipCounts::default(),
             error: None,
             next_error: Instant::now(),
         }

@@ -7,6 +7,7 @@ use rayherd_render::frame::Frame;
 use rayherd_render::light::{Lights, SkyMap};
 use rayherd_render::path::Context;
 use rayherd_render::ray::Ray;
+use rayherd_render::skip::{Skip, Skips};
 use rayherd_render::texture::Texture;
 use rayherd_render::world::{Environment, World};
 use rayherd_scene::grid::Grid;
@@ -31,6 +32,7 @@ pub struct PreparedScene {
     pub objects: Arc<dyn ObjectStore>,
     /// Names how it is cut into splits: rays that wait for a split of one cut mean nothing in another.
     pub cut: String,
+    skips: Skips,
 }
 
 impl PreparedScene {
@@ -79,7 +81,26 @@ impl PreparedScene {
         let cut =
             serde_json::to_vec(&(&manifest.splits, &manifest.grid)).map_err(|e| JobError::Internal(e.to_string()))?;
         let cut = blake3::hash(&cut).to_hex()[..12].to_owned();
-        Ok(PreparedScene { manifest, world, lights, grid, objects, cut })
+        Ok(PreparedScene { manifest, world, lights, grid, objects, cut, skips: Skips::ALL })
+    }
+
+    /// The same where only these skips are made by whatever renders it.
+    pub fn skipping(mut self, skips: Skips) -> Self {
+        self.skips = skips;
+        if !skips.makes(Skip::Cells) {
+            self.grid = self.grid.with_whole_cells();
+            // rays visit cells in another order
+            self.cut.push('w');
+        }
+        if !skips.makes(Skip::Lights) {
+            self.lights = self.lights.leaving_out_none();
+        }
+        self
+    }
+
+    /// What is left out when it is rendered.
+    pub fn skips(&self) -> Skips {
+        self.skips
     }
 
     /// Number of splits.
@@ -117,11 +138,14 @@ impl PreparedScene {
         let mut hasher = blake3::Hasher::new();
         // the number changes whenever another picture is made of the same scene and frame: no run goes on with another program's film
         hasher.update(b"rayherd image 3\0").update(&self.manifest.content.0).update(&frame);
+        if !self.skips.makes(Skip::Lights) {
+            hasher.update(b"\0every light");
+        }
         Ok(hasher.finalize().to_hex().to_string())
     }
     /// What every path of a frame shares, but for textures.
     pub fn context<'a>(&'a self, frame: &'a Frame) -> Context<'a> {
-        Context::new(&self.world, &self.lights, frame)
+        Context::new(&self.world, &self.lights, frame).skipping(self.skips)
     }
 
     /// The split where each film tile's camera rays start: the owner of the first cell on the ray through the middle of

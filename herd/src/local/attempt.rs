@@ -1,24 +1,25 @@
 //! One attempt of a task, on the thread of a slot.
 
+use std::cell::OnceCell;
 use std::collections::BTreeMap;
 
 use rayherd_render::film::FilmPart;
 use rayherd_render::frame::Frame;
-use rayherd_render::path::{Context, Outcome, PathRay, Surface, Surfaces, shade};
-use rayherd_render::ray::{Hit, PrimId};
+use rayherd_render::path::{Context, PathRay};
+use rayherd_render::skip::{Skip, SkipCounts};
 use rayherd_scene::grid::SplitSet;
 use serde::{Deserialize, Serialize};
 
-use super::nodes::Nodes;
+use super::nodes::{NodeBlocks, Nodes};
 use crate::flight::{Flights, PathFlight, ShadowFlight, Visit};
 use crate::job::{JobError, JobSettings, PreparedScene};
 use crate::ledger::{Destination, FilmRef, GroupRef, Outputs};
 use crate::plan::Set;
 use crate::report::Kind;
-use crate::resident::{Lease, Resident};
+use crate::resident::{Lease, Resident, ResidentSurfaces};
 use crate::task::codec;
 use crate::task::groups::{GroupSink, Groups};
-use crate::task::{CameraFeed, Loop, Outbox, Stop};
+use crate::task::{CameraFeed, Loop, Outbox, Shading, Stop};
 use crate::textures::TaskTextures;
 use crate::wave::CameraUnit;
 use crate::wire::ray_group;
@@ -47,6 +48,8 @@ pub struct Made {
     pub film: FilmPart,
     /// Rays that left the split set.
     pub hops: u64,
+    /// What it did not do.
+    pub skipped: SkipCounts,
 }
 
 /// What all attempts share.
@@ -100,9 +103,10 @@ impl GroupSink for Store<'_> {
 pub fn run(shared: &Shared, attempt: &Attempt, stop: &dyn Stop) -> Result<Made, JobError> {
     let sink = Store { shared, attempt };
     let mut groups = Groups::new(&sink, shared.settings.ray_buffer);
+    let skips = shared.scene.skips();
     let mut film = FilmPart::new(shared.frame.size);
-    let mut camera = CameraFeed::new(shared.frame, attempt.camera.clone());
-    let mut trace = Loop::new(shared.settings.kernel, shared.settings.batch as usize)?;
+    let mut camera = CameraFeed::new(shared.frame, attempt.camera.clone(), skips);
+    let mut trace = Loop::new(shared.settings.kernel, shared.settings.batch as usize, skips)?;
     let tiles = shared.nodes.blocks(attempt.node);
     let slots = shared.settings.nodes[attempt.node as usize].slots;
     let textures = TaskTextures::new(shared.scene, shared.nodes.tiles(attempt.node), &tiles, slots);
@@ -115,6 +119,7 @@ pub fn run(shared: &Shared, attempt: &Attempt, stop: &dyn Stop) -> Result<Made, 
         trace: &mut trace,
         camera: &mut camera,
         film: &mut film,
+        unread: 0,
     };
     match &attempt.set {
         Set::Resident(set) => task.resident(set, &mut groups)?,
@@ -122,7 +127,14 @@ pub fn run(shared: &Shared, attempt: &Attempt, stop: &dyn Stop) -> Result<Made, 
         Set::Sharing(split) => task.sharing(*split, &mut groups)?,
         Set::Reduce => task.reduce(&mut groups)?,
     }
+    let unread = task.unread;
     textures.check()?;
+    if !skips.makes(Skip::Film) {
+        film.touch_all();
+    }
+    let mut skipped = trace.skipped();
+    skipped.add(Skip::Attributes, unread);
+    skipped.add(Skip::Film, (film.tiles() - film.touched()) as u64);
     let hops = if attempt.set == Set::Reduce { 0 } else { groups.rays };
     let rays = trace.rays;
     let groups = groups.finish()?;
@@ -136,7 +148,7 @@ pub fn run(shared: &Shared, attempt: &Attempt, stop: &dyn Stop) -> Result<Made, 
     } else {
         None
     };
-    Ok(Made { outputs: Outputs { groups, film: film_ref, rays, non_finite }, film, hops })
+    Ok(Made { outputs: Outputs { groups, film: film_ref, rays, non_finite }, film, hops, skipped })
 }
 
 /// Stops also when a texture cannot be had: what is shaded without it is wrong.
@@ -160,6 +172,45 @@ struct Task<'a, 'f> {
     trace: &'a mut Loop,
     camera: &'a mut CameraFeed<'f>,
     film: &'a mut FilmPart,
+    /// Splits that were used without their attributes.
+    unread: u64,
+}
+
+/// A lease's surfaces: read when a hit is to be shaded, or at once.
+struct Lazy<'l> {
+    lease: &'l Lease<'l>,
+    scene: &'l PreparedScene,
+    blocks: &'l NodeBlocks<'l, 'l>,
+    surfaces: OnceCell<ResidentSurfaces<'l>>,
+}
+
+impl<'l> Lazy<'l> {
+    fn new(lease: &'l Lease<'l>, scene: &'l PreparedScene, blocks: &'l NodeBlocks<'l, 'l>) -> Result<Self, JobError> {
+        let out = Lazy { lease, scene, blocks, surfaces: OnceCell::new() };
+        if !scene.skips().makes(Skip::Attributes) {
+            out.surfaces()?;
+        }
+        Ok(out)
+    }
+
+    /// How many splits were used without.
+    fn unread(&self) -> u64 {
+        if self.surfaces.get().is_none() { self.lease.splits().iter().count() as u64 } else { 0 }
+    }
+}
+
+impl<'l> Shading for Lazy<'l> {
+    type Surfaces = ResidentSurfaces<'l>;
+    fn surfaces(&self) -> Result<&ResidentSurfaces<'l>, JobError> {
+        if self.surfaces.get().is_none() {
+            if self.lease.has_attributes() {
+                self.blocks.count_warm_attributes(self.lease.splits().iter());
+            }
+            // nobody else sets it: a task has one thread
+            let _ = self.surfaces.set(self.lease.surfaces(self.scene, self.blocks)?);
+        }
+        self.surfaces.get().ok_or_else(|| JobError::Internal("surfaces vanished".into()))
+    }
 }
 
 impl Task<'_, '_> {
@@ -200,15 +251,18 @@ impl Task<'_, '_> {
         let (shared, node, stop) = (self.shared, self.attempt.node, self.stop);
         let lease = shared.lease(node, set)?;
         let blocks = shared.nodes.blocks(node);
-        let surfaces = lease.surfaces(shared.scene, &blocks)?;
+        let surfaces = Lazy::new(&lease, shared.scene, &blocks)?;
         let (context, grid) = (shared.context(self.textures), &shared.scene.grid);
+        let complete = lease.is_complete() && context.skips.makes(Skip::Walk);
         self.inputs(self.few(), |t, mut flights| {
-            if lease.is_complete() {
+            if complete {
                 t.trace.run_complete(&context, &lease, &surfaces, &mut flights, t.camera, t.film, stop)
             } else {
                 t.trace.run(&context, grid, &lease, &surfaces, &mut flights, t.camera, t.film, groups, stop)
             }
-        })
+        })?;
+        self.unread += surfaces.unread();
+        Ok(())
     }
 
     /// Demand driven: rays wait in the task for the splits that they need, which come and go one after the other.
@@ -217,11 +271,10 @@ impl Task<'_, '_> {
         let (context, grid) = (shared.context(self.textures), &shared.scene.grid);
         let limit = self.many();
         let mut queues = Queues::default();
-        let mut none = CameraFeed::new(shared.frame, Vec::new());
-        let mut missed = Outcome::default();
+        let mut none = CameraFeed::new(shared.frame, Vec::new(), context.skips);
         self.inputs(limit, |t, flights| {
             for ray in queues.route(shared, flights)? {
-                miss(&context, ray, &mut missed, t.film);
+                t.trace.miss(&context, ray, t.film);
             }
             let mut made: Vec<PathRay> = Vec::new();
             loop {
@@ -233,17 +286,18 @@ impl Task<'_, '_> {
                     }
                     t.trace.count_camera(made.len() as u64, &context);
                     for &ray in &made {
-                        match Visit::START.next(grid, &ray.ray(), &SplitSet::default()) {
+                        match t.trace.next(Visit::START, grid, &ray.ray(), &SplitSet::default()) {
                             Some((to, visit)) => queues.path(to, PathFlight { visit, ..PathFlight::new(ray) })?,
-                            None => miss(&context, ray, &mut missed, t.film),
+                            None => t.trace.miss(&context, ray, t.film),
                         }
                     }
                 }
                 let Some((split, mut flights)) = queues.fullest() else { return Ok(()) };
                 let lease = shared.lease(node, &[split])?;
                 let blocks = shared.nodes.blocks(node);
-                let surfaces = lease.surfaces(shared.scene, &blocks)?;
+                let surfaces = Lazy::new(&lease, shared.scene, &blocks)?;
                 t.trace.run(&context, grid, &lease, &surfaces, &mut flights, &mut none, t.film, &mut queues, stop)?;
+                t.unread += surfaces.unread();
             }
         })
     }
@@ -272,6 +326,9 @@ impl Task<'_, '_> {
                 let (held, cold): (Vec<u32>, Vec<u32>) = together.iter().partition(|s| warm.contains(s));
                 for &s in held.iter().chain(&cold) {
                     let lease = shared.lease(node, &[s])?;
+                    // nothing is shaded here: the hits are decided elsewhere
+                    let blocks = shared.nodes.blocks(node);
+                    t.unread += Lazy::new(&lease, shared.scene, &blocks)?.unread();
                     for batch in flights.paths.chunks_mut(shared.settings.batch as usize) {
                         stop.check()?;
                         t.trace.closest(&lease, batch);
@@ -282,14 +339,13 @@ impl Task<'_, '_> {
                     }
                 }
                 for flight in flights.paths.drain(..) {
-                    let ray = rayherd_render::ray::Ray { tmax: flight.candidate.t, ..flight.ray.ray() };
-                    let next = flight.visit.next(grid, &ray, &set);
+                    let next = t.trace.next(flight.visit, grid, &flight.bounded(context.skips), &set);
                     let visit = next.map_or(Visit::DECIDED, |n| n.1);
                     let bucket = flight.ray.key.pixel % shared.buckets;
                     groups.add_path(Destination::Reduce(bucket), PathFlight { visit, ..flight })?;
                 }
                 for flight in flights.shadows.drain(..) {
-                    match flight.visit.next(grid, &flight.ray.ray(), &set) {
+                    match t.trace.next(flight.visit, grid, &flight.ray.ray(), &set) {
                         Some((to, visit)) => groups.shadow(to, ShadowFlight { visit, ..flight })?,
                         None => {
                             let light = flight.ray.light();
@@ -311,10 +367,11 @@ impl Task<'_, '_> {
         }
         let lease = self.shared.lease(self.attempt.node, &[split])?;
         let blocks = self.shared.nodes.blocks(self.attempt.node);
-        let surfaces = lease.surfaces(self.shared.scene, &blocks)?;
+        let shading = Lazy::new(&lease, self.shared.scene, &blocks)?;
+        let surfaces = shading.surfaces()?;
         for batch in decided.chunks_mut(self.shared.settings.batch as usize) {
             self.stop.check()?;
-            self.trace.shade_decided(context, &lease, &surfaces, batch, flights, self.film)?;
+            self.trace.shade_decided(context, &lease, surfaces, batch, flights, self.film)?;
         }
         Ok(())
     }
@@ -322,7 +379,6 @@ impl Task<'_, '_> {
     /// Merges what map tasks found: of each ray the nearest candidate; it goes on to the next cell, or to its hit.
     fn reduce(&mut self, groups: &mut Groups) -> Result<(), JobError> {
         let (shared, context) = (self.shared, self.shared.context(self.textures));
-        let mut missed = Outcome::default();
         self.inputs(self.few(), |t, mut flights| {
             flights.paths.sort_by_key(|f| (f.ray.key, f.candidate.t.to_bits(), f.candidate.prim));
             flights.paths.dedup_by_key(|f| f.ray.key);
@@ -335,31 +391,12 @@ impl Task<'_, '_> {
                 } else if flight.candidate.is_hit() {
                     groups.path(flight.candidate.split, flight)?;
                 } else {
-                    miss(&context, flight.ray, &mut missed, t.film);
+                    t.trace.miss(&context, flight.ray, t.film);
                 }
             }
             Ok(())
         })
     }
-}
-
-/// Nothing is there to be hit.
-struct NoSurfaces;
-
-impl Surfaces for NoSurfaces {
-    fn surface(&self, _: usize, _: &Hit) -> Surface {
-        unreachable!("a miss has no surface")
-    }
-    fn prim(&self, _: usize, _: &Hit) -> PrimId {
-        unreachable!("a miss has no primitive")
-    }
-}
-
-/// Ends a path that leaves the scene.
-fn miss(context: &Context, ray: PathRay, out: &mut Outcome, film: &mut FilmPart) {
-    out.clear();
-    shade(context, &NoSurfaces, &[ray], &[Hit::miss(f32::INFINITY)], out);
-    out.light.iter().for_each(|l| film.add(l.pixel, l.sample, l.value));
 }
 
 /// Rays that wait inside a task, by split.

@@ -10,6 +10,8 @@ pub mod journal;
 pub mod nodes;
 pub mod owner;
 mod run;
+#[cfg(test)]
+mod skipping;
 pub mod slots;
 #[cfg(test)]
 mod tests;

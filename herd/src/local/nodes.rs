@@ -7,6 +7,7 @@
 use std::sync::{Arc, Mutex, PoisonError, RwLock};
 
 use bytes::Bytes as Body;
+use rayherd_render::skip::Skip;
 use rayherd_scene::objects::ObjectRef;
 use tokio::runtime::Runtime;
 
@@ -65,6 +66,14 @@ pub struct Nodes<'a> {
     /// Nodes that hold a split, by split number.
     holders: RwLock<Vec<Vec<u32>>>,
     counts: Mutex<Counts>,
+    /// What was read at least once; not known where `fetch` reads, or others do.
+    read: Option<Mutex<ReadOnce>>,
+}
+
+/// By number: whether it was read.
+struct ReadOnce {
+    splits: Vec<bool>,
+    tiles: Vec<bool>,
 }
 
 #[derive(Default)]
@@ -80,6 +89,8 @@ impl<'a> Nodes<'a> {
         if settings.nodes.len() > 1 {
             nodes.disks = Some(Disks::new(settings.nodes.len(), nodes.replicas as usize)?);
         }
+        let (splits, tiles) = (scene.manifest.splits.len(), scene.manifest.tiles.len());
+        nodes.read = Some(Mutex::new(ReadOnce { splits: vec![false; splits], tiles: vec![false; tiles] }));
         Ok(nodes)
     }
 
@@ -110,6 +121,7 @@ impl<'a> Nodes<'a> {
             tiles: settings.nodes.iter().map(|_| TileCache::new(settings.texture_memory)).collect(),
             holders: RwLock::new(holders),
             counts: Mutex::new(Counts { nodes, ..Counts::default() }),
+            read: None,
         })
     }
 
@@ -136,6 +148,41 @@ impl<'a> Nodes<'a> {
     /// Blocks as a node sees them.
     pub fn blocks(&self, node: u32) -> NodeBlocks<'_, 'a> {
         NodeBlocks { nodes: self, node }
+    }
+
+    fn note_read(&self, part: Part) {
+        let Some(read) = &self.read else { return };
+        let mut read = read.lock().unwrap_or_else(PoisonError::into_inner);
+        match part {
+            Part::Split(n) => read.splits[n as usize] = true,
+            Part::Tile(n) => read.tiles[n as usize] = true,
+        }
+    }
+
+    /// How many splits and texture tiles no node has read; none if that is not known here.
+    pub fn never_read(&self) -> Option<[u64; 2]> {
+        let read = self.read.as_ref()?.lock().unwrap_or_else(PoisonError::into_inner);
+        Some([&read.splits, &read.tiles].map(|list| list.iter().filter(|&&r| !r).count() as u64))
+    }
+
+    /// Reads what is read though nothing asks for it, as far as the scene's skips do not leave it out: on the first node.
+    ///
+    /// # Errors
+    /// When something cannot be read.
+    pub fn read_unasked(&self) -> Result<(), JobError> {
+        let (skips, blocks) = (self.scene.skips(), self.blocks(0));
+        if !skips.makes(Skip::Splits) {
+            for split in 0..self.scene.splits() {
+                blocks.geometry(split)?;
+                blocks.attributes(split)?;
+            }
+        }
+        if !skips.makes(Skip::Textures) {
+            for tile in (0..).take(self.scene.manifest.tiles.len()) {
+                self.tiles[0].get(tile, &blocks)?;
+            }
+        }
+        Ok(())
     }
 
     /// Counts bytes that a node moved.
@@ -371,6 +418,7 @@ pub struct NodeBlocks<'n, 'a> {
 impl NodeBlocks<'_, '_> {
     fn read(&self, part: Part, kind: Kind, object: &ObjectRef) -> Result<Vec<u8>, JobError> {
         let (nodes, node) = (self.nodes, self.node);
+        nodes.note_read(part);
         if let Some(fetch) = &nodes.fetch {
             let (bytes, place) = fetch.fetch(part, object)?;
             nodes.count(Stage::Trace, Op::Read, kind, node, place, bytes.len() as u64);
@@ -393,11 +441,17 @@ impl NodeBlocks<'_, '_> {
     /// Counts a use of splits that are in memory already.
     pub fn count_warm(&self, splits: &[u32]) {
         for &split in splits {
-            let entry = &self.nodes.scene.manifest.splits[split as usize];
-            let count = |kind, bytes| self.nodes.count(Stage::Trace, Op::Read, kind, self.node, Place::Cache, bytes);
-            count(Kind::Geometry, entry.geometry.bytes);
-            count(Kind::Attributes, entry.attributes.bytes);
+            self.warm_object(Kind::Geometry, &self.nodes.scene.manifest.splits[split as usize].geometry);
         }
+    }
+    /// The same of their attributes.
+    pub fn count_warm_attributes(&self, splits: impl Iterator<Item = u32>) {
+        for split in splits {
+            self.warm_object(Kind::Attributes, &self.nodes.scene.manifest.splits[split as usize].attributes);
+        }
+    }
+    fn warm_object(&self, kind: Kind, object: &ObjectRef) {
+        self.nodes.count(Stage::Trace, Op::Read, kind, self.node, Place::Cache, object.bytes);
     }
 }
 

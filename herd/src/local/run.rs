@@ -51,6 +51,7 @@ pub fn render_local(
         store_film: settings.commits.is_some() || settings.nodes.len() > 1,
         buckets: settings.slots(),
     };
+    shared.nodes.read_unasked()?;
     let Some(commits) = &settings.commits else {
         let ledger = Ledger::new(&scene.image_name(frame)?, tiles(frame));
         let start = Start {

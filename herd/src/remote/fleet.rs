@@ -390,9 +390,9 @@ impl State {
     /// What an attempt's result means to the loop over rounds.
     fn judge(&mut self, result: Result<Done, Failure>) -> Result<Made, JobError> {
         match result {
-            Ok(Done::Made { outputs, hops }) => {
+            Ok(Done::Made { outputs, hops, skipped }) => {
                 self.succeeded();
-                Ok(Made { outputs, film: FilmPart::new(self.size), hops })
+                Ok(Made { outputs, film: FilmPart::new(self.size), hops, skipped })
             }
             Ok(_) => Err(JobError::Internal("a worker reports something else than it was to do".into())),
             Err(Failure::Stopped) => Err(JobError::Stopped),

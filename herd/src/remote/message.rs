@@ -2,6 +2,7 @@
 
 use rayherd_api::{RenderJobSpec, Strategy};
 use rayherd_render::frame::Frame;
+use rayherd_render::skip::SkipCounts;
 use rayherd_scene::objects::ObjectRef;
 use serde::{Deserialize, Serialize};
 
@@ -154,6 +155,9 @@ pub enum Done {
         outputs: Outputs,
         /// Rays that left the split set.
         hops: u64,
+        /// What it did not do.
+        #[serde(default)]
+        skipped: SkipCounts,
     },
     /// Of a merge.
     Merged {

@@ -319,7 +319,7 @@ impl<'l> Station<'l> {
                 let (_, shared) = open()?;
                 let attempt = Attempt { node: self.node(), ..attempt.clone() };
                 let made = attempt::run(shared, &attempt, stop)?;
-                Ok(Done::Made { outputs: made.outputs, hops: made.hops })
+                Ok(Done::Made { outputs: made.outputs, hops: made.hops, skipped: made.skipped })
             }
             Work::Merge { name, parts, spp, picture } => {
                 let (_, shared) = open()?;

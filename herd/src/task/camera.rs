@@ -3,7 +3,8 @@
 use rayherd_render::film::TILE;
 use rayherd_render::frame::Frame;
 use rayherd_render::path::{PathRay, camera_rays};
-use rayherd_render::ray::Ray;
+use rayherd_render::ray::{PathKey, Ray};
+use rayherd_render::skip::{Skip, Skips};
 
 use crate::wave::CameraUnit;
 
@@ -12,7 +13,9 @@ pub struct CameraFeed<'a> {
     frame: &'a Frame,
     units: std::vec::IntoIter<CameraUnit>,
     current: Option<(CameraUnit, Cursor)>,
-    /// Rays made so far.
+    /// How often each sample's ray is made: more than once where siblings have one each.
+    copies: u32,
+    /// Samples whose rays were made so far.
     pub made: u64,
     /// Pixel and sample of those to be made together.
     samples: Vec<[u32; 2]>,
@@ -28,11 +31,13 @@ struct Cursor {
 
 impl<'a> CameraFeed<'a> {
     /// Rays of the units, in their order.
-    pub fn new(frame: &'a Frame, units: Vec<CameraUnit>) -> Self {
-        CameraFeed { frame, units: units.into_iter(), current: None, made: 0, samples: Vec::new(), rays: Vec::new() }
+    pub fn new(frame: &'a Frame, units: Vec<CameraUnit>, skips: Skips) -> Self {
+        let copies = if skips.makes(Skip::Merged) { 1 } else { frame.split.max(1) };
+        let units = units.into_iter();
+        CameraFeed { frame, units, current: None, copies, made: 0, samples: Vec::new(), rays: Vec::new() }
     }
 
-    /// Appends rays until `out` has `len` of them or there are none left.
+    /// Appends rays until `out` has `len` of them (or the siblings of one sample more) or there are none left.
     pub fn fill(&mut self, out: &mut Vec<PathRay>, len: usize) {
         let mut rays = std::mem::take(&mut self.rays);
         rays.clear();
@@ -42,11 +47,20 @@ impl<'a> CameraFeed<'a> {
 
     /// The same, and appends what the kernel takes for each to `rays`.
     pub fn fill_traced(&mut self, out: &mut Vec<PathRay>, rays: &mut Vec<Ray>, len: usize) {
-        let wanted = len.saturating_sub(out.len());
+        let wanted = len.saturating_sub(out.len()).div_ceil(self.copies as usize);
         self.samples.clear();
         self.take(wanted);
         self.made += self.samples.len() as u64;
+        let first = out.len();
         camera_rays(self.frame, &self.samples, out, rays);
+        if self.copies > 1 {
+            let (paths, traced) = (out.split_off(first), rays.split_off(rays.len() - self.samples.len()));
+            for (path, ray) in paths.into_iter().zip(traced) {
+                let sibling = |branch: u32| PathRay { key: PathKey { branch: branch as u16, ..path.key }, ..path };
+                out.extend((0..self.copies).map(sibling));
+                rays.extend((0..self.copies).map(|_| ray));
+            }
+        }
     }
 
     /// Gathers up to `wanted` samples.
@@ -128,7 +142,7 @@ mod tests {
         let pixels: u32 = (0..6).map(|t| tile_pixels(&frame, t)).sum();
         assert_eq!(pixels, 70 * 33);
         for len in [1, 7, 4096, 100_000] {
-            let mut feed = CameraFeed::new(&frame, units.clone());
+            let mut feed = CameraFeed::new(&frame, units.clone(), Skips::ALL);
             let mut keys = BTreeSet::new();
             let mut out = Vec::new();
             loop {

@@ -6,4 +6,4 @@ pub mod groups;
 pub mod trace;
 
 pub use camera::CameraFeed;
-pub use trace::{Loop, Outbox, Stop};
+pub use trace::{Loop, Outbox, Shading, Stop};

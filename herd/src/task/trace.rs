@@ -5,9 +5,10 @@
 
 use rayherd_render::bvh::{Kernel, Tracer, UnsupportedKernel};
 use rayherd_render::film::FilmPart;
-use rayherd_render::path::{Context, Outcome, PathRay, Surfaces, shade, shade_traced};
-use rayherd_render::ray::{Hit, MISS, Ray};
-use rayherd_scene::grid::Grid;
+use rayherd_render::path::{Context, Outcome, PathRay, Surface, Surfaces, shade, shade_traced};
+use rayherd_render::ray::{Hit, MISS, PrimId, Ray};
+use rayherd_render::skip::{Skip, SkipCounts, Skips};
+use rayherd_scene::grid::{Grid, SplitSet};
 
 use super::CameraFeed;
 use crate::flight::{Candidate, Flights, PathFlight, ShadowFlight, Visit};
@@ -21,6 +22,29 @@ pub trait Outbox {
     fn path(&mut self, to: u32, flight: PathFlight) -> Result<(), JobError>;
     /// A shadow ray for a split.
     fn shadow(&mut self, to: u32, flight: ShadowFlight) -> Result<(), JobError>;
+}
+
+/// The surfaces of a task's splits, to be had once a hit is to be shaded.
+pub trait Shading {
+    /// Of this kind.
+    type Surfaces: Surfaces;
+    /// They.
+    ///
+    /// # Errors
+    /// When they cannot be read.
+    fn surfaces(&self) -> Result<&Self::Surfaces, JobError>;
+}
+
+/// Of rays none of which hits anything.
+struct NoSurfaces;
+
+impl Surfaces for NoSurfaces {
+    fn surface(&self, _: usize, _: &Hit) -> Surface {
+        unreachable!("a miss has no surface")
+    }
+    fn prim(&self, _: usize, _: &Hit) -> PrimId {
+        unreachable!("a miss has no primitive")
+    }
 }
 
 /// Asked between batches: an error ends the task (it was killed, the job is over).
@@ -43,11 +67,15 @@ pub struct Loop {
     hits: Vec<Hit>,
     occluded: Vec<bool>,
     outcome: Outcome,
+    skips: Skips,
+    skipped: SkipCounts,
+    /// Cells whose tight boxes rays missed.
+    cells: u64,
 }
 
 impl Loop {
     /// A loop that traces `batch` rays together, or 1 or [`MOST`] if it is out of this range.
-    pub fn new(kernel: Kernel, batch: usize) -> Result<Self, UnsupportedKernel> {
+    pub fn new(kernel: Kernel, batch: usize, skips: Skips) -> Result<Self, UnsupportedKernel> {
         Ok(Loop {
             tracer: Tracer::new(kernel)?,
             batch: batch.clamp(1, MOST),
@@ -56,17 +84,29 @@ impl Loop {
             hits: Vec::new(),
             occluded: Vec::new(),
             outcome: Outcome::default(),
+            skips,
+            skipped: SkipCounts::default(),
+            cells: 0,
         })
+    }
+
+    /// What was left out.
+    pub fn skipped(&self) -> SkipCounts {
+        let mut all = self.skipped;
+        all += &self.outcome.counters.skips();
+        all.add(Skip::Cells, self.cells);
+        all.add(Skip::Merged, self.rays.merged);
+        all
     }
 
     /// Traces everything to its end, where no ray can leave: the plain loop, which nothing beside it slows down.
     ///
     /// The flights must have no candidate elsewhere, as all splits are here.
-    pub fn run_complete<S: Surfaces>(
+    pub fn run_complete<S: Shading>(
         &mut self,
         context: &Context,
         resident: &Resident,
-        surfaces: &S,
+        shading: &S,
         flights: &mut Flights,
         camera: &mut CameraFeed,
         film: &mut FilmPart,
@@ -81,17 +121,24 @@ impl Loop {
         }
         loop {
             stop.check()?;
+            self.skipped.add(Skip::Walk, self.outcome.shadow.len() as u64);
             self.occlude(resident, film);
             let from = pending.len().saturating_sub(self.batch);
-            let made = camera.made;
+            let waiting = pending.len();
             camera.fill_traced(&mut pending, &mut rays, from + self.batch);
-            self.count_camera(camera.made - made, context);
+            self.count_camera((pending.len() - waiting) as u64, context);
             if pending.is_empty() {
                 return Ok(());
             }
             self.hits.resize(pending.len() - from, Hit::miss(0.0));
             self.tracer.closest(forest, &rays[from..], &mut self.hits);
-            shade_traced(context, surfaces, &pending[from..], &rays[from..], &self.hits, &mut self.outcome);
+            self.skipped.add(Skip::Walk, self.hits.len() as u64);
+            let (paths, traced, hits, out) = (&pending[from..], &rays[from..], &self.hits, &mut self.outcome);
+            if hits.iter().any(Hit::is_hit) {
+                shade_traced(context, shading.surfaces()?, paths, traced, hits, out);
+            } else {
+                shade_traced(context, &NoSurfaces, paths, traced, hits, out);
+            }
             pending.truncate(from);
             rays.truncate(from);
             self.collect(film);
@@ -119,12 +166,12 @@ impl Loop {
     }
 
     /// Traces rays until all have ended or left the resident splits.
-    pub fn run<S: Surfaces>(
+    pub fn run<S: Shading>(
         &mut self,
         context: &Context,
         grid: &Grid,
         resident: &Resident,
-        surfaces: &S,
+        shading: &S,
         flights: &mut Flights,
         camera: &mut CameraFeed,
         film: &mut FilmPart,
@@ -157,9 +204,8 @@ impl Loop {
             ready.clear();
             ready_hits.clear();
             for (flight, hit) in current.iter().zip(&self.hits) {
-                let mut ray = flight.ray.ray();
-                ray.tmax = flight.candidate.t;
-                if let Some((to, visit)) = flight.visit.next(grid, &ray, resident.splits()) {
+                let ray = flight.bounded(self.skips);
+                if let Some((to, visit)) = flight.visit.next(grid, &ray, resident.splits(), &mut self.cells) {
                     outbox.path(to, PathFlight { visit, ..*flight })?;
                 } else if flight.candidate.is_hit() && !hit.is_hit() {
                     if flight.visit == Visit::DECIDED {
@@ -171,7 +217,11 @@ impl Loop {
                     ready_hits.push(*hit);
                 }
             }
-            shade(context, surfaces, &ready, &ready_hits, &mut self.outcome);
+            if ready_hits.iter().any(Hit::is_hit) {
+                shade(context, shading.surfaces()?, &ready, &ready_hits, &mut self.outcome);
+            } else {
+                shade(context, &NoSurfaces, &ready, &ready_hits, &mut self.outcome);
+            }
             self.collect(film);
             self.take_spawned(flights);
         }
@@ -181,11 +231,14 @@ impl Loop {
     /// miss when there is none or it is elsewhere.
     pub fn closest(&mut self, resident: &Resident, batch: &mut [PathFlight]) {
         self.rays_in.clear();
-        self.rays_in.extend(batch.iter().map(|f| Ray { tmax: f.candidate.t, ..f.ray.ray() }));
+        let skips = self.skips;
+        self.rays_in.extend(batch.iter().map(|f| f.bounded(skips)));
         self.hits.resize(batch.len(), Hit::miss(0.0));
         self.tracer.closest(resident.forest(), &self.rays_in, &mut self.hits);
+        let mut beaten = 0;
         for (flight, hit) in batch.iter_mut().zip(&mut self.hits) {
             if !hit.is_hit() {
+                beaten += u64::from(flight.candidate.is_hit());
                 continue;
             }
             let prim = resident.forest().prim_id(hit.prim);
@@ -194,10 +247,19 @@ impl Loop {
             {
                 flight.candidate = found;
             } else {
-                // the candidate is at the same distance and goes first: its primitive is not here
+                // the candidate goes first: its primitive is not here
                 hit.prim = MISS;
             }
         }
+        if skips.makes(Skip::Beaten) {
+            self.skipped.add(Skip::Beaten, beaten);
+        }
+    }
+
+    /// Ends a path that leaves the scene.
+    pub fn miss(&mut self, context: &Context, ray: PathRay, film: &mut FilmPart) {
+        shade(context, &NoSurfaces, &[ray], &[Hit::miss(f32::INFINITY)], &mut self.outcome);
+        self.collect(film);
     }
 
     /// Traces shadow rays: those that pass go on, or bring their light.
@@ -217,7 +279,7 @@ impl Loop {
             if self.occluded[i] {
                 continue;
             }
-            if let Some((to, visit)) = flight.visit.next(grid, &self.rays_in[i], resident.splits()) {
+            if let Some((to, visit)) = flight.visit.next(grid, &self.rays_in[i], resident.splits(), &mut self.cells) {
                 outbox.shadow(to, ShadowFlight { visit, ..*flight })?;
             } else {
                 let light = flight.ray.light();
@@ -264,12 +326,22 @@ impl Loop {
         self.outcome.clear();
     }
 
-    /// Counts camera rays.
+    /// Counts camera rays, as a [`CameraFeed`] made them.
     pub fn count_camera(&mut self, made: u64, context: &Context) {
-        self.rays.camera += made;
         self.rays.closest += made;
-        // siblings share the camera ray that they would each have traced
-        self.rays.merged += made * u64::from(context.frame.split - 1);
+        let siblings = u64::from(context.frame.split);
+        if context.skips.makes(Skip::Merged) {
+            self.rays.camera += made;
+            // siblings share the camera ray that they would each have traced
+            self.rays.merged += made * (siblings - 1);
+        } else {
+            self.rays.camera += made / siblings;
+        }
+    }
+
+    /// Where a ray goes next; see [`Visit::next`].
+    pub fn next(&mut self, visit: Visit, grid: &Grid, ray: &Ray, resident: &SplitSet) -> Option<(u32, Visit)> {
+        visit.next(grid, ray, resident, &mut self.cells)
     }
 }
 

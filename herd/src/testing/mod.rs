@@ -216,6 +216,57 @@ pub fn floor(lamp: &Lamp) -> Description {
     Description { shapes, materials: vec![half, black], environment, ..cornell() }
 }
 
+/// The box with 60 small lamps, half of them on its left wall, half in its middle with their backs to the right; a mirror and a glass ball, no
+/// sky.
+pub fn lamps() -> Description {
+    let mut out = Description { environment: None, ..cornell() };
+    out.shapes.retain(|s| s.emission.is_none());
+    let smooth = Bsdf::Dielectric { eta: 1.5, reflect: [1.0; 3], transmit: [1.0; 3] };
+    let mirror = Bsdf::Conductor { eta: [0.2, 0.9, 1.1], k: [3.9, 2.5, 2.1], specular: [1.0; 3] };
+    let first = out.materials.len() as u32;
+    out.materials.extend([material("glass", smooth), material("mirror", mirror)]);
+    for (shape, number) in out.shapes.iter_mut().filter(|s| s.name.ends_with("ball")).zip([first, first + 1]) {
+        shape.material = number;
+    }
+    let s = 0.04;
+    for i in 0..30 {
+        let (y, z) = (-0.9 + 0.3 * f64::from(i % 6), -0.8 + 0.3 * f64::from(i / 6));
+        let light = Some([20.0 + f64::from(i) as f32, 25.0, 30.0]);
+        // fronts to the right and to the left: what is right of the middle sees half of them
+        let left = sheet([-0.98, y, z], [0.0, s, 0.0], [0.0, 0.0, s], 1);
+        let right = sheet([0.2, y, z], [0.0, 0.0, s], [0.0, s, 0.0], 1);
+        out.shapes.push(shape(&format!("left lamp {i}"), left, 0, light));
+        out.shapes.push(shape(&format!("right lamp {i}"), right, 0, light));
+    }
+    out
+}
+
+/// A closed bumpy surface of some thousand triangles, as from a scan, under a sky and a lamp.
+pub fn scan() -> Description {
+    let (across, down) = (60u32, 30u32);
+    let mut positions = Vec::new();
+    for j in 0..=down {
+        for i in 0..across {
+            let turns = f64::from(i) / f64::from(across) * std::f64::consts::TAU;
+            let angle = f64::from(j) / f64::from(down) * std::f64::consts::PI;
+            let r = 0.7 + 0.1 * libm::sin(5.0 * turns) * libm::sin(4.0 * angle);
+            let ring = r * libm::sin(angle);
+            positions.push([ring * libm::cos(turns), r * libm::cos(angle), ring * libm::sin(turns)]);
+        }
+    }
+    let at = |i: u32, j: u32| j * across + i % across;
+    let quads = (0..down).flat_map(|j| (0..across).map(move |i| (i, j)));
+    let two = |(i, j)| [[at(i, j), at(i + 1, j), at(i + 1, j + 1)], [at(i, j), at(i + 1, j + 1), at(i, j + 1)]];
+    let triangles = quads.flat_map(two).collect();
+    let blob = Geometry::Inline { positions, normals: vec![], triangles, uv: vec![] };
+    let lamp = sheet([-0.5, 1.5, -0.5], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0], 2);
+    Description {
+        shapes: vec![shape("blob", blob, 0, None), shape("lamp", lamp, 0, Some([4.0; 3]))],
+        environment: Some(Environment::Constant([0.3; 3])),
+        ..cornell()
+    }
+}
+
 /// Prepares a description, cut into splits, into memory.
 pub fn prepared(description: &Description, splits: u32, overlap_reduction: bool) -> PreparedScene {
     let objects = Arc::new(MemoryObjects::default());

@@ -85,6 +85,16 @@ impl FilmPart {
         self.tiles.iter().flatten().count()
     }
 
+    /// How many tiles it has, touched or not.
+    pub fn tiles(&self) -> usize {
+        self.tiles.len()
+    }
+
+    /// Touches all tiles, so that all are held and stored.
+    pub fn touch_all(&mut self) {
+        self.tiles.iter_mut().for_each(|tile| _ = tile.get_or_insert_with(Tile::new));
+    }
+
     /// Memory of the sums in bytes.
     pub fn memory(&self) -> usize {
         self.touched() * (TILE * TILE) as usize * size_of::<Sums>() + self.tiles.len() * size_of::<Option<Tile>>()

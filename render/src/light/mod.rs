@@ -224,6 +224,14 @@ impl Lights {
         Lights { sources, tree, ends, in_tree, by_prim, sky, sky_probability, only_triangles, few }
     }
 
+    /// The same, but that no source is left out where it cannot shine: to see what leaving them out saves.
+    pub fn leaving_out_none(mut self) -> Lights {
+        if let Some(tree) = &mut self.tree {
+            tree.leave_out_none();
+        }
+        self
+    }
+
     /// Whether there is nothing to sample.
     pub fn is_empty(&self) -> bool {
         self.sources.is_empty()
@@ -246,7 +254,7 @@ impl Lights {
     /// `o` its back: that sample is worth 0.
     #[inline(always)]
     pub fn sample(&self, o: Vec3, choice: u32, place: [u32; 2]) -> Option<LightSample> {
-        self.sample_chosen(self.choose(o, choice)?, o, place)
+        self.sample_chosen(self.choose(o, choice).0?, o, place)
     }
 
     /// The same of what was chosen, for callers that choose for many at once.
@@ -315,24 +323,27 @@ impl Lights {
         }
     }
 
-    /// The source in whose interval the number lies at the point; `None` where nothing shines there.
+    /// The source in whose interval the number lies at the point, `None` where nothing shines there; and whether sources were left out on the
+    /// way to it, as they cannot shine there.
     #[inline(always)]
-    pub(crate) fn choose(&self, o: Vec3, number: u32) -> Option<Choice> {
+    pub(crate) fn choose(&self, o: Vec3, number: u32) -> (Option<Choice>, bool) {
         let number = u64::from(number);
         if let Some(tree) = &self.tree
             && number < tree.share()
         {
-            let (source, numbers) = tree.choose(o, number)?;
-            return Some(Choice { source, probability: probability(numbers) });
+            let (chosen, fewer) = tree.choose(o, number);
+            let choice = |(source, numbers)| Choice { source, probability: probability(numbers) };
+            return (chosen.map(choice), fewer);
         }
         let i = match self.ends.len() {
-            0 => return None,
+            0 => return (None, false),
             // few: count the ends passed, without branches to mispredict
             n if n <= FEW => self.ends.iter().filter(|&&end| end <= number).count(),
             _ => self.ends.partition_point(|&end| end <= number),
         };
         let source = self.in_tree + i;
-        (i < self.ends.len()).then(|| Choice { source, probability: self.sources[source].probability })
+        let choice = (i < self.ends.len()).then(|| Choice { source, probability: self.sources[source].probability });
+        (choice, false)
     }
 }
 

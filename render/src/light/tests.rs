@@ -122,7 +122,7 @@ fn both_sides_agree() {
         let choice = rng.u32();
         let Some(s) = lights.sample(o, choice, [rng.u32(), rng.u32()]) else { continue };
         assert!((s.d.length() - 1.0).abs() < 1e-6 && s.pdf > 0.0 && s.pdf.is_finite() && s.tmax >= 0.0);
-        let i = lights.choose(o, choice).unwrap().source;
+        let i = lights.choose(o, choice).0.unwrap().source;
         if i >= primitives.len() {
             assert!((s.pdf / lights.sky(s.d).1 - 1.0).abs() < 1e-6 && s.tmax == f32::INFINITY);
             continue;
@@ -169,14 +169,14 @@ fn choice_is_by_power() {
     let mut counts = [0.0; 3];
     for i in 0..n {
         let number = (u64::from(i) * (1 << 32) / u64::from(n)) as u32;
-        counts[lights.choose(Vec3::ZERO, number).unwrap().source] += 1.0;
+        counts[lights.choose(Vec3::ZERO, number).0.unwrap().source] += 1.0;
     }
     for i in 0..3 {
         assert!((counts[i] / f64::from(n) - expected[i]).abs() < 2e-5, "{counts:?} {expected:?}");
         assert!((f64::from(lights.sources[i].probability) - expected[i]).abs() < 1e-7);
     }
     assert!(lights.sample(Vec3::new(0.0, 3.0, 0.0), 0, [1 << 31; 2]).is_none());
-    assert_eq!(lights.choose(Vec3::ZERO, u32::MAX).map(|c| c.source), Some(2));
+    assert_eq!(lights.choose(Vec3::ZERO, u32::MAX).0.map(|c| c.source), Some(2));
     assert_eq!(lights.pdf(11, Vec3::ZERO, 1.0, 1.0), 0.0);
 }
 

@@ -64,12 +64,16 @@ pub(crate) struct Node {
     sin_normals: [f32; WIDTH],
     /// At or below this cosine, of the angle from the nearest normal, it is dark.
     dark: [f32; WIDTH],
+    /// What is dark counts for: 0, by which it is left out.
+    of_dark: [f32; WIDTH],
     /// Sum of the largest intensities; the whole tree's is 1.
     intensity: [f32; WIDTH],
     /// Sources below; 0 where there is no child.
     count: [u32; WIDTH],
     /// A node, or a source and [`LEAF`].
     child: [u32; WIDTH],
+    /// Sources below all children.
+    sources: u32,
 }
 
 impl Tree {
@@ -113,20 +117,32 @@ impl Tree {
         self.share
     }
 
+    /// Leaves nothing out that is dark at a point: it is chosen as little as may be.
+    pub(super) fn leave_out_none(&mut self) {
+        for node in &mut self.nodes {
+            node.of_dark = node.count.map(|n| if n > 0 { f32::MIN_POSITIVE } else { 0.0 });
+        }
+    }
+
     /// The source that a number below [`Tree::share`] chooses at a point, and how many numbers choose it there; `None` where the
-    /// bounds of what is left show that it does not shine there.
+    /// bounds of what is left show that it does not shine there. And whether sources were left out.
     #[inline(always)]
-    pub(super) fn choose(&self, o: Vec3, mut number: u64) -> Option<(usize, u64)> {
+    pub(super) fn choose(&self, o: Vec3, mut number: u64) -> (Option<(usize, u64)>, bool) {
         let mut length = self.share;
         let mut node = &self.nodes[0];
+        let mut fewer = false;
         loop {
-            let ends = node.ends(o, length)?;
+            let (ends, count) = node.ends(o, length);
+            fewer |= count < node.sources;
+            if count == 0 {
+                return (None, fewer);
+            }
             let slot = ends.iter().filter(|&&end| end <= number).count();
             let start = if slot == 0 { 0 } else { ends[slot - 1] };
             (number, length) = (number - start, ends[slot] - start);
             let child = node.child[slot];
             if child & LEAF != 0 {
-                return Some(((child ^ LEAF) as usize, length));
+                return (Some(((child ^ LEAF) as usize, length)), fewer);
             }
             node = &self.nodes[child as usize];
         }
@@ -146,7 +162,10 @@ impl Tree {
         let mut length = self.share;
         for &place in way[..levels].iter().rev() {
             let (node, slot) = (place as usize / WIDTH, place as usize % WIDTH);
-            let Some(ends) = self.nodes[node].ends(o, length) else { return 0 };
+            let (ends, count) = self.nodes[node].ends(o, length);
+            if count == 0 {
+                return 0;
+            }
             length = ends[slot] - if slot == 0 { 0 } else { ends[slot - 1] };
             if length == 0 {
                 return 0;
@@ -158,19 +177,22 @@ impl Tree {
 
 impl Node {
     const EMPTY: Node = {
-        let zero = [0.0; WIDTH];
+        let (zero, infinite) = ([0.0; WIDTH], [f32::INFINITY; WIDTH]);
         Node {
             center: [zero; 3],
             radius: zero,
-            radius2: zero,
+            // every point is near it, and it is dark there
+            radius2: infinite,
             near: zero,
             axis: [zero; 3],
             cos_normals: zero,
             sin_normals: zero,
-            dark: zero,
+            dark: infinite,
+            of_dark: zero,
             intensity: zero,
             count: [0; WIDTH],
             child: [0; WIDTH],
+            sources: 0,
         }
     };
 
@@ -191,6 +213,7 @@ impl Node {
         self.dark[slot] = (libm::cos(bounds.emission.min(std::f64::consts::PI)) - MARGIN) as f32;
         self.intensity[slot] = (bounds.intensity / total) as f32;
         (self.count[slot], self.child[slot]) = (count as u32, child);
+        self.sources += count as u32;
     }
 
     /// How many children it has: the first ones.
@@ -204,7 +227,7 @@ impl Node {
         (self.count[k] == 1).then_some(self.child[k] ^ LEAF)
     }
 
-    /// What may arrive at `o` from child `k` on a surface that faces it, roughly; 0 only if nothing does, or there is no child.
+    /// What may arrive at `o` from child `k` on a surface that faces it, roughly; 0 only if nothing does (or what dark children count for), or there is no child.
     #[inline(always)]
     pub(crate) fn importance(&self, k: usize, o: Vec3) -> f32 {
         let [x, y, z] = [o.x - self.center[0][k], o.y - self.center[1][k], o.z - self.center[2][k]];
@@ -228,12 +251,13 @@ impl Node {
         // NaN too becomes a number: a point that is none chooses something
         let importance = if importance > f32::MIN_POSITIVE { importance } else { f32::MIN_POSITIVE };
         let importance = if importance < LARGEST { importance } else { LARGEST };
-        if cos <= self.dark[k] || self.count[k] == 0 { 0.0 } else { importance }
+        if cos <= self.dark[k] { self.of_dark[k] } else { importance }
     }
 
-    /// Where the children's intervals of [0, `length`) end; `None` if no child shines at `o`.
+    /// Where the children's intervals of [0, `length`) end, and how many sources there are below those that shine at `o`; without any the ends
+    /// mean nothing.
     #[inline(always)]
-    fn ends(&self, o: Vec3, length: u64) -> Option<[u64; WIDTH]> {
+    fn ends(&self, o: Vec3, length: u64) -> ([u64; WIDTH], u32) {
         let mut importances = [0.0; WIDTH];
         for k in 0..WIDTH {
             importances[k] = self.importance(k, o);
@@ -245,14 +269,11 @@ impl Node {
             count += if importances[k] > 0.0 { self.count[k] } else { 0 };
             (sums[k], counts[k]) = (sum, count);
         }
-        if count == 0 {
-            return None;
-        }
         let mut ends = [0; WIDTH];
         for k in 0..WIDTH {
             ends[k] = end((sums[k], sum), (counts[k], count), length);
         }
-        Some(ends)
+        (ends, count)
     }
 }
 

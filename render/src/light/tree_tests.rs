@@ -95,7 +95,7 @@ fn intervals_are_exact_and_leave_out_only_the_dark() {
             assert!(sum <= share);
             for _ in 0..20 {
                 let number = rng.u32();
-                match lights.choose(o, number) {
+                match lights.choose(o, number).0 {
                     Some(Choice { source, probability: said }) if source < lights.in_tree => {
                         assert!(u64::from(number) < share);
                         assert_eq!(said.to_bits(), probability(numbers[source]).to_bits());
@@ -121,7 +121,7 @@ fn choices_follow_their_probabilities() {
         let samples = 200_000;
         let mut counts = vec![0.0; numbers.len() + 1];
         for _ in 0..samples {
-            counts[lights.choose(o, rng.u32()).map_or(numbers.len(), |c| c.source)] += 1.0;
+            counts[lights.choose(o, rng.u32()).0.map_or(numbers.len(), |c| c.source)] += 1.0;
         }
         let rest = ALL - numbers.iter().sum::<u64>();
         let share = |n: u64| n as f64 / ALL as f64 * f64::from(samples);
@@ -209,7 +209,7 @@ fn odd_trees() {
             let numbers = numbers(&lights, o);
             assert_eq!(numbers.iter().sum::<u64>(), ALL, "{o}");
             assert!(numbers.iter().all(|&n| n > 0), "{o}: {numbers:?}");
-            assert!(lights.choose(o, rng.u32()).is_some_and(|c| c.probability > 0.0));
+            assert!(lights.choose(o, rng.u32()).0.is_some_and(|c| c.probability > 0.0));
         }
     }
 }

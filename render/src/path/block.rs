@@ -13,6 +13,7 @@ use crate::light::{Choice, Few, FewTriangles, Node, TriangleLight, end, probabil
 use crate::math::{UnitDir, offset_origin, unit};
 use crate::ray::{PathKey, Ray};
 use crate::sampler::{BSDF, LIGHT, LIGHT_CHOICE, ROULETTE, Streams};
+use crate::skip::Skip;
 
 /// Vertices of a block.
 pub(super) const N: usize = 32;
@@ -78,6 +79,8 @@ pub(super) struct Block {
     place_bits: [[u32; N]; 2],
     choice: [u32; N],
     chosen: [Option<Choice>; N],
+    /// Choices since the last flush of which some lights were left out.
+    fewer: u64,
     roulette: [bool; N],
     // of the light chosen
     light_p0: Lanes3,
@@ -140,6 +143,7 @@ impl Default for Block {
             place_bits: [[0; N]; 2],
             choice: [0; N],
             chosen: [None; N],
+            fewer: 0,
             roulette: [false; N],
             light_p0: Lanes3::ZERO,
             light_e1: Lanes3::ZERO,
@@ -207,6 +211,10 @@ impl Block {
         } else {
             wide::compute(self, context);
         }
+        out.counters.chosen_of_fewer += std::mem::take(&mut self.fewer);
+        if context.skips.makes(Skip::Shadows) {
+            self.count_unlit(out);
+        }
         if self.passes[..self.len].contains(&true) {
             self.emit_mixed(out, plain);
         } else {
@@ -223,7 +231,7 @@ impl Block {
         self.choose_lights(context);
         self.sample_lights();
         self.other_lights(context);
-        self.shadow_rays();
+        self.shadow_rays(!context.skips.makes(Skip::Shadows));
         self.next_rays(context.frame.split as f32);
     }
 
@@ -274,8 +282,11 @@ impl Block {
         }
         for i in 0..self.len {
             // where a vertex passes there is no point to choose for
-            self.chosen[i] =
-                if self.passes[i] { None } else { context.lights.choose(self.origin.get(i), self.choice[i]) };
+            let (chosen, fewer) =
+                if self.passes[i] { (None, false) } else { context.lights.choose(self.origin.get(i), self.choice[i]) };
+            // what is seen from behind is black whatever shines there
+            self.fewer += u64::from(fewer & self.seen[i]);
+            self.chosen[i] = chosen;
             let Some(choice) = self.chosen[i] else { continue };
             let Some((triangle, radiance)) = context.lights.triangle(choice) else { continue };
             self.light_p0.set(i, triangle.p0);
@@ -317,6 +328,10 @@ impl Block {
                 count[i] += u32::from(importance > 0.0);
                 (sums[k][i], counts[k][i]) = (all[i], count[i]);
             }
+        }
+        for i in 0..self.len {
+            let is_fewer = (count[i] as usize) < few.len();
+            self.fewer += u64::from(is_fewer & self.seen[i] & !self.passes[i]);
         }
         let (mut begin, mut numbers) = ([0; N], [0; N]);
         for (k, light) in few.iter().enumerate() {
@@ -403,8 +418,9 @@ impl Block {
 
     // one loop for what is done in f64, one for the rest: a loop's vectors are as wide as its widest type allows
 
+    /// `sends`: also where they bring nothing.
     #[inline(always)]
-    fn shadow_rays(&mut self) {
+    fn shadow_rays(&mut self, sends: bool) {
         for i in 0..N {
             let (dir, d) = snap(self.light_d.get(i));
             self.shadow_dir[i] = dir;
@@ -422,7 +438,8 @@ impl Block {
                 self.lit[i] & self.seen[i],
             );
             self.contribution.set(i, contribution);
-            self.casts[i] = (contribution.x != 0.0) | (contribution.y != 0.0) | (contribution.z != 0.0);
+            let brings = (contribution.x != 0.0) | (contribution.y != 0.0) | (contribution.z != 0.0);
+            self.casts[i] = brings | (sends & self.lit[i] & self.seen[i]);
         }
     }
 
@@ -453,6 +470,15 @@ impl Block {
             self.next_pdf[i] = pdf;
             self.fate[i] = fate;
         }
+    }
+
+    /// Counts the vertices without a shadow ray; those that pass are counted where they are shaded.
+    fn count_unlit(&self, out: &mut Outcome) {
+        let mut unlit = 0u32;
+        for i in 0..N {
+            unlit += u32::from((i < self.len) & self.seen[i] & !self.casts[i] & !self.passes[i]);
+        }
+        out.counters.unlit += u64::from(unlit);
     }
 
     /// Appends what came of vertices none of which passes: without branches that depend on them.

@@ -22,6 +22,7 @@ use crate::light::Lights;
 use crate::math::UnitDir;
 use crate::ray::{Hit, PathKey, PrimId, Ray};
 use crate::sampler::Stream;
+use crate::skip::{Skip, SkipCounts, Skips};
 use crate::texture::{NoTextures, Textures};
 use crate::world::{Primitive, World};
 
@@ -138,17 +139,24 @@ pub struct Context<'a> {
     pub frame: &'a Frame,
     /// Tiles of the world's textures.
     pub textures: &'a dyn Textures,
+    /// What is left out.
+    pub skips: Skips,
 }
 
 impl<'a> Context<'a> {
-    /// Of a world without bitmaps.
+    /// Of a world without bitmaps, every skip made.
     pub fn new(world: &'a World, lights: &'a Lights, frame: &'a Frame) -> Self {
-        Context { world, lights, frame, textures: &NoTextures }
+        Context { world, lights, frame, textures: &NoTextures, skips: Skips::ALL }
     }
 
     /// With tiles.
     pub fn with(self, textures: &'a dyn Textures) -> Self {
         Context { textures, ..self }
+    }
+
+    /// With these skips; the lights must have been made for them.
+    pub fn skipping(self, skips: Skips) -> Self {
+        Context { skips, ..self }
     }
 }
 
@@ -196,6 +204,16 @@ pub struct Counters {
     pub depth: u64,
     /// Paths ended because nothing is reflected: black, the back of a one-sided surface, a direction below the surface.
     pub absorbed: u64,
+    /// Vertices that cast no shadow ray, as it would have brought nothing.
+    pub unlit: u64,
+    /// Choices of a light of which some were left out, as they cannot shine there.
+    pub chosen_of_fewer: u64,
+    /// Vertices that scatter to single directions only, for which no light was chosen.
+    pub lightless: u64,
+    /// Hits of materials that have nothing beside their model.
+    pub bare: u64,
+    /// Rays that left the scene where no sky was looked up.
+    pub skyless: u64,
 }
 
 impl Counters {
@@ -206,6 +224,27 @@ impl Counters {
         self.roulette += other.roulette;
         self.depth += other.depth;
         self.absorbed += other.absorbed;
+        self.unlit += other.unlit;
+        self.chosen_of_fewer += other.chosen_of_fewer;
+        self.lightless += other.lightless;
+        self.bare += other.bare;
+        self.skyless += other.skyless;
+    }
+
+    /// Of them, what was left out.
+    pub fn skips(&self) -> SkipCounts {
+        let mut out = SkipCounts::default();
+        for (skip, times) in [
+            (Skip::Roulette, self.roulette),
+            (Skip::Shadows, self.unlit),
+            (Skip::Lights, self.chosen_of_fewer),
+            (Skip::Lobes, self.lightless),
+            (Skip::Details, self.bare),
+            (Skip::Sky, self.skyless),
+        ] {
+            out.add(skip, times);
+        }
+        out
     }
 }
 

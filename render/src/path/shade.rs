@@ -10,6 +10,7 @@ use crate::material::{Blend, Bsdf, Detail, Material, Relief, ReliefKind};
 use crate::math::{UnitDir, unit};
 use crate::ray::{Hit, PathKey, Ray};
 use crate::sampler::{BSDF, LIGHT, LIGHT_CHOICE, LOBE, ROULETTE, Stream};
+use crate::skip::Skip;
 use crate::world::Primitive;
 
 /// Shades each ray with its hit and appends what comes of it to `out`.
@@ -38,11 +39,14 @@ pub fn shade_traced<S: Surfaces>(
 ) {
     let mut block = out.block.take().unwrap_or_default();
     out.counters.shaded += rays.len() as u64;
-    let has_sky = context.lights.has_sky();
+    let looks_up = looks_up(context);
+    let bares = context.skips.makes(Skip::Details);
     for (index, ((ray, traced), hit)) in rays.iter().zip(traced).zip(hits).enumerate() {
         if !hit.is_hit() {
             out.counters.missed += 1;
-            if has_sky && !hidden(context, ray) {
+            if !looks_up {
+                out.counters.skyless += 1;
+            } else if is_first(context, ray) && !hidden(context, ray) {
                 let (radiance, pdf) = context.lights.sky(traced.d.into());
                 emit(ray, radiance, pdf, out);
             }
@@ -52,6 +56,8 @@ pub fn shade_traced<S: Surfaces>(
             continue;
         };
         let flat = match (&material.bsdf, &material.detail) {
+            // by way of `scatter_plain`, which looks for detail
+            _ if !bares => None,
             (Bsdf::Diffuse { reflectance }, None) => surfaces.flat_triangle(index, hit).map(|vertices| FlatDiffuse {
                 vertices,
                 u: hit.u,
@@ -87,7 +93,9 @@ pub(super) fn shade_plain<S: Surfaces>(
         out.counters.shaded += 1;
         if !hit.is_hit() {
             out.counters.missed += 1;
-            if !hidden(context, ray) {
+            if !looks_up(context) {
+                out.counters.skyless += 1;
+            } else if is_first(context, ray) && !hidden(context, ray) {
                 let (radiance, pdf) = context.lights.sky(ray.dir.decode().into());
                 emit(ray, radiance, pdf, out);
             }
@@ -113,6 +121,19 @@ fn flush<S: Surfaces>(
         let (ray, hit) = (&rays[index], &hits[index]);
         scatter_plain(context, ray, key, throughput, hit, &surfaces.surface(index, hit), out);
     });
+}
+
+/// Whether the sky is looked up where nothing is met.
+#[inline(always)]
+fn looks_up(context: &Context) -> bool {
+    context.lights.has_sky() || !context.skips.makes(Skip::Sky)
+}
+
+/// Whether a ray stands for what its sample comes upon first: the camera ray that siblings share, or the first of theirs where they do
+/// not; and every other ray.
+#[inline(always)]
+fn is_first(context: &Context, ray: &PathRay) -> bool {
+    (ray.key.vertex != 0) | (ray.key.branch == 0) | context.skips.makes(Skip::Merged)
 }
 
 #[inline]
@@ -171,7 +192,9 @@ fn arrive<'a, S: Surfaces>(
             pass_through(surfaces, index, ray, hit, out);
             return None;
         }
-        emit_surface(context, surfaces, index, ray, hit, emission.into(), out);
+        if is_first(context, ray) {
+            emit_surface(context, surfaces, index, ray, hit, emission.into(), out);
+        }
     }
     let number = u32::from(ray.key.vertex) + 1;
     if number >= frame.max_depth {
@@ -180,10 +203,17 @@ fn arrive<'a, S: Surfaces>(
     }
     let material = &world.materials[shape.material as usize];
     let throughput = Vec3::from(ray.throughput);
-    // a mirror would send every sibling the same way
-    if number == 1 && frame.split > 1 && !material.is_mirror() {
-        let share = throughput / frame.split as f32;
-        return Some(Leaving { material, children: frame.split, throughput: share });
+    out.counters.bare += u64::from(material.detail.is_none() & context.skips.makes(Skip::Details));
+    if number == 1 && frame.split > 1 {
+        let merged = context.skips.makes(Skip::Merged);
+        // a mirror would send every sibling the same way
+        if !material.is_mirror() {
+            let share = throughput / frame.split as f32;
+            return Some(Leaving { material, children: if merged { frame.split } else { 1 }, throughput: share });
+        }
+        if !is_first(context, ray) {
+            return None;
+        }
     }
     Some(Leaving { material, children: 1, throughput })
 }
@@ -253,9 +283,10 @@ pub(super) fn scatter_plain(
     );
     let look;
     let mut lobe = numbers[LOBE];
+    let skips = context.skips;
     let (material, bsdf, opacity) = match material.detail.as_deref() {
-        None => (material, &material.bsdf, 1.0),
-        Some(_) => {
+        None if skips.makes(Skip::Details) => (material, &material.bsdf, 1.0),
+        _ => {
             let (met, opacity);
             (met, look, opacity) = appearance(context, material, surface, hit, d, &mut at, &mut lobe);
             (met, look.as_ref().unwrap_or(&met.bsdf), opacity)
@@ -274,10 +305,21 @@ pub(super) fn scatter_plain(
     let siblings = frame.split as f32;
 
     let place = [numbers[LIGHT], numbers[LIGHT + 1]];
-    let light =
-        if bsdf.is_delta() || !seen { None } else { context.lights.sample(origin, numbers[LIGHT_CHOICE], place) };
+    let sample_light = |from: Vec3, out: &mut Outcome| {
+        let (choice, fewer) = context.lights.choose(from, numbers[LIGHT_CHOICE]);
+        out.counters.chosen_of_fewer += u64::from(fewer);
+        context.lights.sample_chosen(choice?, from, place)
+    };
+    let blind = bsdf.is_delta() && skips.makes(Skip::Lobes);
+    out.counters.lightless += u64::from(blind && seen);
+    let light = if blind || !seen { None } else { sample_light(origin, out) };
+    let sends = !skips.makes(Skip::Shadows);
+    let shadows = out.shadow.len();
+    // at most one shadow ray is cast
+    let asks = seen && !blind && !sends;
+    let note_unlit = |out: &mut Outcome| out.counters.unlit += u64::from(asks && out.shadow.len() == shadows);
     let shadow = |o: Vec3, dir: UnitDir, tmax: f32, contribution: Vec3, out: &mut Outcome| {
-        if contribution != Vec3::ZERO {
+        if contribution != Vec3::ZERO || sends {
             let ray = ShadowRay { o: o.to_array(), dir, tmax, contribution: contribution.to_array(), key };
             out.shadow.push(ray);
             out.shadow_rays.push(ray.ray());
@@ -294,6 +336,7 @@ pub(super) fn scatter_plain(
                 towards_light(throughput, reflectance, at.normal, light.d, wi, light.pdf, light.radiance, true);
             shadow(origin, dir, light.tmax, contribution, out);
         }
+        note_unlit(out);
         let (d, above) = cosine_direction(at.normal, direction);
         let (dir, wi) = snap(d);
         let (throughput, pdf, fate) = onwards(throughput, reflectance, at.normal, wi, above, go_on, roulette, siblings);
@@ -306,7 +349,7 @@ pub(super) fn scatter_plain(
             Some(light) if bsdf.transmits() && light.d.dot(at.normal) < 0.0 => {
                 let beyond = at.origin_beyond();
                 // the choice depends on the point: at an end of an interval it may fall on another source, perhaps in front
-                let light = context.lights.sample(beyond, numbers[LIGHT_CHOICE], place);
+                let light = sample_light(beyond, out);
                 (beyond, light.filter(|light| light.d.dot(at.normal) < 0.0))
             }
             light => (origin, light),
@@ -316,13 +359,17 @@ pub(super) fn scatter_plain(
             let wi = Vec3::from(dir.decode());
             let local = basis.to_local(wi);
             // by the geometric normal too, or light would leak through the surface
-            if same_side(wi.dot(at.normal), local.z, bsdf.transmits()) {
+            let contribution = if same_side(wi.dot(at.normal), local.z, bsdf.transmits()) {
                 let scattered = bsdf.eval(wo, local, at.from_front);
                 let weight = power_heuristic(light.pdf, scattered.pdf * opacity) / light.pdf;
                 let value = scattered.value * opacity;
-                shadow(from, dir, light.tmax, throughput * value * light.radiance * weight, out);
-            }
+                throughput * value * light.radiance * weight
+            } else {
+                Vec3::ZERO
+            };
+            shadow(from, dir, light.tmax, contribution, out);
         }
+        note_unlit(out);
         let lobe = unit(lobe);
         // at opacity 1 never, as the number is below 1
         let passes = lobe >= opacity;

@@ -74,6 +74,8 @@ pub struct Grid {
     /// Cell number by lattice index, [`EMPTY`] where there is none.
     dense: Vec<u32>,
     owning: SplitSet,
+    /// Whether cells' boxes are those of what is inside.
+    tight: bool,
 }
 
 /// What the walk needs of a cell.
@@ -133,7 +135,19 @@ impl Grid {
         if owners.len() > u32::MAX as usize {
             return refuse("too many owners".to_owned());
         }
-        Ok(Grid { lattice, cells, owners, dense, owning })
+        Ok(Grid { lattice, cells, owners, dense, owning, tight: true })
+    }
+
+    /// The same with all of each occupied cell for its box: to see what tight boxes save. Rays that are on their way through the one cannot go on
+    /// through the other, as the order of cells is another.
+    pub fn with_whole_cells(mut self) -> Grid {
+        for (index, &number) in (0..).zip(&self.dense) {
+            if let (Some(cell), Some(at)) = (self.cells.get_mut(number as usize), self.lattice.coordinates(index)) {
+                (cell.lo, cell.hi) = self.lattice.cell_box_f32(at);
+            }
+        }
+        self.tight = false;
+        self
     }
 
     /// Its geometry.

@@ -109,6 +109,17 @@ impl Grid {
     /// A progress that names no cell counts as [`Progress::START`] (nothing is missed). A ray with NaN, or without a
     /// direction, hits nothing.
     pub fn next_foreign(&self, ray: &Ray, from: Progress, resident: &SplitSet) -> Option<Foreign<'_>> {
+        self.next_foreign_counted(ray, from, resident, &mut 0)
+    }
+
+    /// The same; adds to `missed` the cells on its way that hold something outside `resident` and whose tight boxes the ray misses.
+    pub fn next_foreign_counted(
+        &self,
+        ray: &Ray,
+        from: Progress,
+        resident: &SplitSet,
+        missed: &mut u64,
+    ) -> Option<Foreign<'_>> {
         let lattice = self.lattice();
         let walk = WalkRay::new(ray, lattice.magnitude())?;
         // the axis that crosses most cells: along it a slab holds few cells of the ray
@@ -164,7 +175,10 @@ impl Grid {
                         if !self.is_foreign(cell, resident) {
                             continue;
                         }
-                        let Some(t) = walk.enter(&cell.lo, &cell.hi) else { continue };
+                        let Some(t) = walk.enter(&cell.lo, &cell.hi) else {
+                            *missed += u64::from(self.tight);
+                            continue;
+                        };
                         let key = (t, number);
                         if t <= walk.tmax && last_key.is_none_or(|l| key > l) && best.is_none_or(|b| key < b) {
                             best = Some(key);

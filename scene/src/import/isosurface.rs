@@ -13,6 +13,8 @@ mod tables;
 mod tests;
 
 use std::path::Path;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
 
 use march::{Cursor, Grid, Slab, Slice};
 
@@ -27,6 +29,8 @@ pub struct IsoSurfaceSource {
     file: VolumeFile,
     grid: Grid,
     shape: u32,
+    /// Cells that all passes so far did not look into.
+    passed: Arc<AtomicU64>,
 }
 
 impl IsoSurfaceSource {
@@ -42,8 +46,20 @@ impl IsoSurfaceSource {
             let [x, y, z] = dims;
             return limit(format!("{x} x {y} x {z} samples hold no surface: at least 2 are needed along each axis"));
         }
-        let grid = Grid { width: dims[0], height: dims[1], iso, to_world: Affine::IDENTITY, mirrored: false };
-        Ok(IsoSurfaceSource { file, grid, shape: 0 }.placed(&Affine::IDENTITY, 0))
+        let grid =
+            Grid { width: dims[0], height: dims[1], iso, to_world: Affine::IDENTITY, mirrored: false, thorough: false };
+        Ok(IsoSurfaceSource { file, grid, shape: 0, passed: Arc::default() }.placed(&Affine::IDENTITY, 0))
+    }
+
+    /// The same, looking also into cells that the surface does not cross: to see what passing them by saves.
+    pub fn thorough(mut self) -> Self {
+        self.grid.thorough = true;
+        self
+    }
+
+    /// Cells that all passes so far did not look into, as the surface does not cross them.
+    pub fn cells_passed(&self) -> u64 {
+        self.passed.load(Ordering::Relaxed)
     }
 
     /// The same, moved by `to_world` after the volume's own placement, as shape number `shape`.
@@ -77,6 +93,7 @@ impl IsoSurfaceSource {
             kept: Vec::new(),
             ended: false,
             before: 0,
+            passed: &self.passed,
         };
         stream.slices.next(&mut stream.low.samples)?;
         stream.low.mark(stream.grid.width, stream.grid.iso);
@@ -106,6 +123,7 @@ pub struct IsoSurfaceStream<'a> {
     ended: bool,
     /// Bytes that were read for this pass before it began.
     before: u64,
+    passed: &'a AtomicU64,
 }
 
 impl IsoSurfaceStream<'_> {
@@ -137,6 +155,7 @@ impl RecordStream for IsoSurfaceStream<'_> {
             if !more {
                 std::mem::swap(&mut self.low, &mut self.high);
                 self.z += 1;
+                self.passed.fetch_add(self.cursor.passed, Ordering::Relaxed);
                 self.cursor = Cursor::default();
                 self.ended = !self.read()?;
             }

@@ -4,6 +4,8 @@ use std::path::{Path, PathBuf};
 use std::sync::OnceLock;
 use std::sync::atomic::{AtomicU64, Ordering};
 
+use rayherd_render::skip::{Skip, Skips};
+
 use super::isosurface::IsoSurfaceSource;
 use super::mesh::{MeshOptions, MeshStream};
 use super::obj::ObjReader;
@@ -15,7 +17,7 @@ use crate::ImportError;
 use crate::description::{Description, Geometry, MeshFormat, Shape};
 use crate::record::{Record, RecordSource, RecordStream, SphereRecord};
 
-/// How much memory reading may take.
+/// How much memory reading may take, and what it leaves out. No record depends on it.
 #[derive(Clone, Debug)]
 pub struct StreamOptions {
     /// Most bytes of one mesh's vertex arrays in memory; larger ones spill to a mapped temporary file.
@@ -24,12 +26,14 @@ pub struct StreamOptions {
     pub spill_limit: u64,
     /// Its folder; the system's temporary folder when `None`.
     pub spill_folder: Option<PathBuf>,
+    /// Of these [`Skip::Volume`].
+    pub skips: Skips,
 }
 
 impl Default for StreamOptions {
     /// 512 MiB in memory, then up to 64 GiB in the system's temporary folder.
     fn default() -> Self {
-        StreamOptions { vertex_budget: 512 << 20, spill_limit: 64 << 30, spill_folder: None }
+        StreamOptions { vertex_budget: 512 << 20, spill_limit: 64 << 30, spill_folder: None, skips: Skips::ALL }
     }
 }
 
@@ -64,6 +68,7 @@ impl<'a> DescriptionSource<'a> {
         if slot.get().is_none() {
             let source = IsoSurfaceSource::new(path, iso)?.placed(&shape.to_world, number as u32);
             read = source.file().header_bytes();
+            let source = if self.options.skips.makes(Skip::Volume) { source } else { source.thorough() };
             // two passes that begin at once read the headers twice; the first to finish is kept
             let _ = slot.set(source);
         }
@@ -74,6 +79,11 @@ impl<'a> DescriptionSource<'a> {
     /// Bytes of vertex arrays that went to temporary files, over all passes so far.
     pub fn spilled_bytes(&self) -> u64 {
         self.spilled.load(Ordering::Relaxed)
+    }
+
+    /// Cells of volumes that their surfaces do not cross and that were not looked into, over all passes so far.
+    pub fn cells_passed(&self) -> u64 {
+        self.volumes.iter().flatten().filter_map(OnceLock::get).map(IsoSurfaceSource::cells_passed).sum()
     }
 
     /// A pass over one shape.

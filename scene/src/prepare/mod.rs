@@ -35,6 +35,7 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use rayherd_render::bvh::BuildError;
+use rayherd_render::skip::Skip;
 use rayherd_render::texture::Texture;
 use rayherd_render::world::{Beam, Environment, ShapeInfo, Sun, World};
 use rayon::prelude::*;
@@ -72,6 +73,15 @@ pub struct Prepared {
     pub reused: bool,
     /// What it took.
     pub report: PrepareReport,
+}
+
+impl Prepared {
+    /// Objects that were not made and stored again, as they were there: those that the manifest names.
+    pub fn kept(&self) -> u64 {
+        let m = &self.manifest;
+        let all = 1 + u64::from(m.sky_map.is_some()) + m.tiles.len() as u64 + 2 * m.splits.len() as u64;
+        if self.reused { all } else { 0 }
+    }
 }
 
 /// Why a scene cannot be prepared.
@@ -143,7 +153,8 @@ pub fn prepare(
 ) -> Result<Prepared, PrepareError> {
     settings.check().map_err(PrepareError::Settings)?;
     let print = fingerprint(description)?;
-    match Manifest::find(store, &print, settings) {
+    let found = if spool.skips.makes(Skip::Prepared) { Manifest::find(store, &print, settings) } else { Ok(None) };
+    match found {
         Ok(Some((reference, manifest))) => {
             let report = PrepareReport::reused(reference.bytes);
             let defaults = Defaults::of(description);

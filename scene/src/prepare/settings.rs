@@ -2,6 +2,7 @@
 
 use std::path::PathBuf;
 
+use rayherd_render::skip::Skips;
 use serde::{Deserialize, Serialize};
 
 /// How the source is cut into splits.
@@ -65,18 +66,20 @@ impl PrepareSettings {
     }
 }
 
-/// What preparing may use beside the store. It changes no byte of the result.
+/// What preparing may use beside the store, and what it leaves out. It changes no byte of the result.
 #[derive(Clone, Debug)]
 pub struct SpoolSettings {
     /// Records that wait in memory, bytes; what is more goes to a temporary file.
     pub memory: u64,
     /// Folder of that file; the system's temporary folder when `None`.
     pub folder: Option<PathBuf>,
+    /// Of these [`rayherd_render::skip::Skip::Prepared`].
+    pub skips: Skips,
 }
 
 impl Default for SpoolSettings {
     /// 64 MiB, about what one split of a scene that is worth a spool takes with its tree; then the system's temporary folder.
     fn default() -> Self {
-        SpoolSettings { memory: 64 << 20, folder: None }
+        SpoolSettings { memory: 64 << 20, folder: None, skips: Skips::ALL }
     }
 }

@@ -238,7 +238,7 @@ fn the_bytes_do_not_depend_on_threads_or_the_spool() {
     for (threads, memory) in [(1, u64::MAX), (2, 0), (3, 50_000)] {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
         let store = MemoryObjects::new();
-        let spool = SpoolSettings { memory, folder: None };
+        let spool = SpoolSettings { memory, ..SpoolSettings::default() };
         let source = List::new(records.clone());
         let prepared = pool
             .install(|| prepare(&description("list"), &source, &settings(11, true), &spool, &store, &NoProgress))
@@ -364,7 +364,7 @@ fn what_cannot_be_prepared_is_said() {
     let empty = run(&[flat, far], &settings(2, true), &store).unwrap_err();
     assert!(matches!(empty, PrepareError::Empty { records: 2, degenerate: 1, out_of_range: 1, .. }), "{empty}");
     assert!(matches!(run(&[flat], &settings(0, true), &store), Err(PrepareError::Settings(_))));
-    let lost = SpoolSettings { memory: 0, folder: Some("/nowhere/at/all".into()) };
+    let lost = SpoolSettings { memory: 0, folder: Some("/nowhere/at/all".into()), ..SpoolSettings::default() };
     let source = List::new(scene(1, 100));
     let error = prepare(&description("list"), &source, &settings(2, true), &lost, &store, &NoProgress).unwrap_err();
     assert!(matches!(error, PrepareError::Spool { .. }), "{error}");

@@ -15,6 +15,7 @@ use crate::path::reference::{self, Tracer};
 use crate::path::shade::shade_plain;
 use crate::path::{Context, Outcome, PathRay, ShadowRay, camera_ray, camera_rays, shade};
 use crate::ray::{Hit, PathKey};
+use crate::skip::Skips;
 use crate::testing::Rng;
 use crate::world::Beam;
 
@@ -119,15 +120,17 @@ fn lamps(more: u32) -> Scene {
 #[test]
 fn batches_do_not_matter() {
     for (scene, split) in [(cornell::scene(), 1), (lamps(3), 2), (lamps(9), 1), (motley(), 3)] {
-        check_batches(&scene, split);
+        for skips in [Skips::ALL, Skips::NONE] {
+            check_batches(&scene, split, skips);
+        }
     }
 }
 
-fn check_batches(scene: &Scene, split: u32) {
+fn check_batches(scene: &Scene, split: u32, skips: Skips) {
     let frame = Frame { split, ..cornell::frame(16) };
     let world = scene.world();
     let lights = Lights::new(&world);
-    let context = Context::new(&world, &lights, &frame).with(&scene.tiles);
+    let context = Context::new(&world, &lights, &frame).with(&scene.tiles).skipping(skips);
     let mut rays: Vec<PathRay> = (0..256).map(|p| camera_ray(&frame, p, 3)).collect();
     for _ in 0..4 {
         let hits: Vec<Hit> = rays.iter().map(|r| scene.closest(&r.ray())).collect();

@@ -41,6 +41,8 @@ pub struct Grid {
     pub to_world: Affine,
     /// Whether `to_world` mirrors, so that triangles are turned over.
     pub mirrored: bool,
+    /// Cells that the surface does not cross are looked into all the same.
+    pub thorough: bool,
 }
 
 /// Where a pass stands within a slab: cells are visited by row, then along the row.
@@ -51,6 +53,8 @@ pub struct Cursor {
     /// Cells of the current word that are still to be done.
     cells: u64,
     started: bool,
+    /// Cells that were not looked into.
+    pub passed: u64,
 }
 
 /// Cells of a slab between two slices.
@@ -87,26 +91,32 @@ impl Grid {
             if at.row + 1 >= self.height {
                 return false;
             }
-            at.cells = self.crossed(slab, at.row, at.word, words);
+            let valid = self.valid(at.word);
+            at.cells = if self.thorough { valid } else { self.crossed(slab, at.row, at.word, words) & valid };
+            at.passed += u64::from((valid & !at.cells).count_ones());
         }
     }
 
-    /// Cells of a word of cells that have corners on both sides.
+    /// Cells of a word of cells that are there.
+    fn valid(&self, word: usize) -> u64 {
+        let cells = (self.width - 1).saturating_sub(word * 64).min(64);
+        if cells == 64 { !0 } else { (1 << cells) - 1 }
+    }
+
+    /// Cells of a word of cells that have corners on both sides; beyond the row anything.
     fn crossed(&self, slab: &Slab, row: usize, word: usize, words: usize) -> u64 {
         let (mut any, mut all) = (0, !0);
         for bits in [&slab.low.bits, &slab.high.bits] {
             for r in [row, row + 1] {
                 let at = r * words + word;
                 let here = bits[at];
-                // the upper neighbour in x; beyond the row there is no cell (masked below)
+                // the upper neighbour in x
                 let next = here >> 1 | if word + 1 < words { bits[at + 1] << 63 } else { 0 };
                 any |= here | next;
                 all &= here & next;
             }
         }
-        let cells = (self.width - 1).saturating_sub(word * 64).min(64);
-        let valid = if cells == 64 { !0 } else { (1 << cells) - 1 };
-        any & !all & valid
+        any & !all
     }
 
     #[inline]

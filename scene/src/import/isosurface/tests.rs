@@ -24,7 +24,8 @@ type Triangle = [[f64; 3]; 3];
 
 /// Marches over samples in memory.
 fn march(dims: [usize; 3], samples: &[f64], iso: f64, to_world: Affine) -> Vec<Triangle> {
-    let grid = Grid { width: dims[0], height: dims[1], iso, to_world, mirrored: to_world.determinant() < 0.0 };
+    let mirrored = to_world.determinant() < 0.0;
+    let grid = Grid { width: dims[0], height: dims[1], iso, to_world, mirrored, thorough: false };
     let slices: Vec<Slice> = samples
         .chunks_exact(dims[0] * dims[1])
         .map(|s| {
