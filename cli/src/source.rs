@@ -24,6 +24,9 @@ pub fn open(spec: &RenderJobSpec, objects: &dyn ObjectStore, outputs: &[PathBuf]
     for s in &description.substitutions {
         tracing::warn!("{}: {} is not supported; in its place: {}", s.place, s.what, s.stand_in);
     }
+    for note in &description.notes {
+        tracing::info!("{}: {}", note.place, note.text);
+    }
     let source = DescriptionSource::new(&description, StreamOptions::default());
     let progress = StageBar::new();
     let prepared =
