@@ -40,6 +40,9 @@ pub fn open(
     for s in &description.substitutions {
         tracing::warn!("{}: {} is not supported; in its place: {}", s.place, s.what, s.stand_in);
     }
+    for note in &description.notes {
+        tracing::info!("{}: {}", note.place, note.text);
+    }
     let source = DescriptionSource::new(&description, StreamOptions { skips, ..StreamOptions::default() });
     let progress = StageBar::new();
     let spool = SpoolSettings { skips, ..SpoolSettings::default() };

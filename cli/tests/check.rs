@@ -20,24 +20,38 @@ fn a_good_scene_is_described_and_left_alone() {
     assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 0);
 }
 
-/// What a bare mesh loses is told, once.
+/// A bare mesh has its own materials; what of them is not read is named.
 #[test]
-fn materials_of_a_mesh_are_missed_aloud() {
+fn materials_of_a_mesh_are_told() {
     let folder = tempfile::tempdir().unwrap();
-    let text = "# two\nmtllib a.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nusemtl red\nmtllib b.mtl\nf 1 2 3\n";
+    let text = "# two\nmtllib a.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nusemtl red\nf 1 2 3\n";
     fs::write(folder.path().join("a.obj"), text).unwrap();
-    let told = |run: &common::Run| {
-        assert_eq!(run.code, 0, "{}", run.err);
-        run.err.matches("a.obj:2: the file's materials (mtllib) are not read").count()
-    };
-    assert_eq!(told(&rayherd(folder.path(), &["check", "a.obj"])), 1);
-    assert_eq!(told(&rayherd(folder.path(), &["prepare", "a.obj", "--store", "s"])), 1);
+    let check = |arguments: &[&str]| rayherd(folder.path(), &[&["check"], arguments].concat());
+    let run = check(&["a.obj"]);
+    assert!(
+        run.code == 2 && run.err.contains("a.obj:2: material library \"a.mtl\" (there is no such file)"),
+        "{}",
+        run.err
+    );
+    assert_eq!(check(&["a.obj", "--substitute"]).code, 0);
+    assert_eq!(check(&["a.obj", "--albedo", "0.5"]).code, 0);
+
+    let library = "newmtl red\nKd 1 0 0\nKa 1 1 1\nnewmtl odd\nKd 0 1 0\nKa 1 1 1\ndisp none.png\n";
+    fs::write(folder.path().join("a.mtl"), library).unwrap();
+    let run = check(&["a.obj"]);
+    assert_eq!(run.code, 2, "{}", run.err);
+    assert!(run.err.contains("a.mtl:7: disp in a material library is not supported"), "{}", run.err);
+    assert_eq!(run.err.matches("ka is passed over").count(), 1, "once for each library: {}", run.err);
+    assert!(run.out.contains("1 obj, 2 part of an obj"), "{}", run.out);
+    let run = check(&["a.obj", "--substitute"]);
+    assert!(run.code == 0 && run.err.contains("a.mtl:3: ka is passed over"), "{}", run.err);
+
     // a scene around it has materials of its own
     let scene = "<scene version='3.0.0'><shape type='obj'><string name='filename' value='a.obj'/></shape>\
         <emitter type='constant'/><sensor type='perspective' id='one'/>\n<sensor type='perspective' id='two'/></scene>";
     fs::write(folder.path().join("s.xml"), scene).unwrap();
-    let run = rayherd(folder.path(), &["check", "s.xml"]);
-    assert_eq!(told(&run), 0);
+    let run = check(&["s.xml"]);
+    assert!(run.code == 0 && !run.err.contains("a.mtl"), "{}", run.err);
     assert!(run.err.contains("s.xml:2: sensor \"two\" is left out"), "{}", run.err);
 }
 

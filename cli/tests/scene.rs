@@ -38,6 +38,15 @@ fn scenes_grow_and_lose_their_order() {
     assert!(said.starts_with("room.xml: 120 lamps"), "{said}");
     let room = rayherd(folder.path(), &["render", "room.xml", "--size", "8x8", "--spp", "2"]);
     assert!(room.code == 0 && room.out.contains("room.exr"), "{}{}", room.out, room.err);
+    refused(&["house", "--size", "0", "h"], &["1..=256"]);
+    let said = tool(&["house", "--size", "1", "h"]);
+    assert!(said.starts_with("h: ") && said.contains("triangles"), "{said}");
+    // by its XML, and as a folder of meshes with materials of their own
+    for scene in ["h/house.xml", "h"] {
+        let house = rayherd(folder.path(), &["render", scene, "--size", "8x8", "--spp", "2"]);
+        assert_eq!(house.code, 0, "{}{}", house.out, house.err);
+        assert_eq!(rayherd(folder.path(), &["check", scene]).code, 0);
+    }
     // found before anything is written: this would be 1.2 TB
     let many = ["replicate", "t.obj", "-o", "x.ply", "--copies", "1000000,1000,1", "--step", "1,1,1"];
     refused(&many, &["12000000000 vertices", "fewer levels or copies"]);

@@ -175,9 +175,10 @@ impl Attributes {
 
     #[cfg(test)]
     fn bytes(&self) -> usize {
-        let AttributeBlock { shapes, normals, uvs } = &self.block;
+        let AttributeBlock { shapes, normals, uvs, attributes } = &self.block;
         let starts = self.starts.as_ref().map_or(0, Vec::capacity);
-        4 * (shapes.capacity() + starts + self.shapes.capacity()) + 36 * normals.capacity() + 24 * uvs.capacity()
+        let floats = 36 * (normals.capacity() + attributes.capacity()) + 24 * uvs.capacity();
+        4 * (shapes.capacity() + starts + self.shapes.capacity()) + floats
     }
 
     #[inline(always)]
@@ -219,6 +220,7 @@ impl Surfaces for ResidentSurfaces<'_> {
             geometry: self.resident.forest.primitive(hit),
             normals: attributes.normals(local),
             uv: attributes.block.uvs.get(local).copied(),
+            attribute: attributes.block.attributes.get(local).copied(),
         }
     }
     #[inline(always)]

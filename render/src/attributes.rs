@@ -1,8 +1,8 @@
 //! Shading attributes of a split's primitives, an object beside its geometry.
 //!
-//! Layout, little endian: `RHA1`, flags u32 (1: normals, 2: texture coordinates), number of primitives u32, number of runs u32, then the runs
+//! Layout, little endian: `RHA1`, flags u32 (1: normals, 2: texture coordinates, 4: the mesh's attribute), number of primitives u32, number of runs u32, then the runs
 //! (length u32, shape u32; neighbours differ), then 9 f32 of normals per primitive, then 6 f32 of texture coordinates per
-//! primitive. A primitive without normals has nine zeros.
+//! primitive, then 9 f32 of the attribute per primitive. A primitive without normals or attribute has nine zeros.
 
 const MAGIC: &[u8; 4] = b"RHA1";
 const HEADER: usize = 16;
@@ -16,6 +16,8 @@ pub struct AttributeBlock {
     pub normals: Vec<[[f32; 3]; 3]>,
     /// Texture coordinates of the three vertices of each primitive, or empty when none has any.
     pub uvs: Vec<[[f32; 2]; 3]>,
+    /// The mesh's attribute at the three vertices of each primitive, or empty when none has any.
+    pub attributes: Vec<[[f32; 3]; 3]>,
 }
 
 /// Why bytes are no attribute block.
@@ -49,14 +51,18 @@ impl AttributeBlock {
     /// The block as bytes.
     ///
     /// # Panics
-    /// When `normals` or `uvs` is neither empty nor as long as `shapes`: a mistake of the caller.
+    /// When `normals`, `uvs` or `attributes` is neither empty nor as long as `shapes`: a mistake of the caller.
     pub fn encode(&self) -> Vec<u8> {
         let n = self.shapes.len();
         assert!(self.normals.is_empty() || self.normals.len() == n, "normals for each primitive or none");
         assert!(self.uvs.is_empty() || self.uvs.len() == n, "texture coordinates for each primitive or none");
+        assert!(self.attributes.is_empty() || self.attributes.len() == n, "an attribute for each primitive or none");
         let runs: Vec<[u32; 2]> = self.shapes.chunk_by(|a, b| a == b).map(|run| [run.len() as u32, run[0]]).collect();
-        let flags = u32::from(!self.normals.is_empty()) | u32::from(!self.uvs.is_empty()) << 1;
-        let mut out = Vec::with_capacity(HEADER + 8 * runs.len() + 36 * self.normals.len() + 24 * self.uvs.len());
+        let flags = u32::from(!self.normals.is_empty())
+            | u32::from(!self.uvs.is_empty()) << 1
+            | u32::from(!self.attributes.is_empty()) << 2;
+        let floats = 36 * self.normals.len() + 24 * self.uvs.len() + 36 * self.attributes.len();
+        let mut out = Vec::with_capacity(HEADER + 8 * runs.len() + floats);
         out.extend(MAGIC);
         for word in [flags, n as u32, runs.len() as u32] {
             out.extend(word.to_le_bytes());
@@ -64,7 +70,8 @@ impl AttributeBlock {
         for word in runs.as_flattened() {
             out.extend(word.to_le_bytes());
         }
-        for x in self.normals.as_flattened().as_flattened().iter().chain(self.uvs.as_flattened().as_flattened()) {
+        let [normals, uvs] = [self.normals.as_flattened().as_flattened(), self.uvs.as_flattened().as_flattened()];
+        for x in normals.iter().chain(uvs).chain(self.attributes.as_flattened().as_flattened()) {
             out.extend(x.to_le_bytes());
         }
         out
@@ -78,7 +85,7 @@ impl AttributeBlock {
             return Err(AttributeError::Magic);
         }
         let [flags, n, runs] = [word(4), word(8), word(12)];
-        if flags > 3 {
+        if flags > 7 {
             return Err(AttributeError::Flags(flags));
         }
         if n != primitives {
@@ -86,8 +93,9 @@ impl AttributeBlock {
         }
         let normals = if flags & 1 != 0 { n as usize } else { 0 };
         let uvs = if flags & 2 != 0 { n as usize } else { 0 };
+        let attributes = if flags & 4 != 0 { n as usize } else { 0 };
         // each factor is below 2^32 and the sizes below 2^6: no overflow in 64 bits
-        let expected = HEADER as u64 + 8 * u64::from(runs) + 36 * normals as u64 + 24 * uvs as u64;
+        let expected = HEADER as u64 + 8 * u64::from(runs) + 36 * (normals + attributes) as u64 + 24 * uvs as u64;
         if expected != bytes.len() as u64 {
             return Err(AttributeError::Length { expected, found: bytes.len() as u64 });
         }
@@ -103,16 +111,14 @@ impl AttributeBlock {
         }
         let floats = |at: usize| f32::from_bits(word(at));
         let normals_end = runs_end + 36 * normals;
+        let uvs_end = normals_end + 24 * uvs;
+        let threes = |at: usize| std::array::from_fn(|v| std::array::from_fn(|c| floats(at + 12 * v + 4 * c)));
+        let twos = |at: usize| std::array::from_fn(|v| std::array::from_fn(|c| floats(at + 8 * v + 4 * c)));
         Ok(AttributeBlock {
             shapes,
-            normals: (runs_end..normals_end)
-                .step_by(36)
-                .map(|at| std::array::from_fn(|v| std::array::from_fn(|c| floats(at + 12 * v + 4 * c))))
-                .collect(),
-            uvs: (normals_end..bytes.len())
-                .step_by(24)
-                .map(|at| std::array::from_fn(|v| std::array::from_fn(|c| floats(at + 8 * v + 4 * c))))
-                .collect(),
+            normals: (runs_end..normals_end).step_by(36).map(threes).collect(),
+            uvs: (normals_end..uvs_end).step_by(24).map(twos).collect(),
+            attributes: (uvs_end..bytes.len()).step_by(36).map(threes).collect(),
         })
     }
 }
@@ -124,30 +130,31 @@ mod tests {
     use super::*;
     use crate::testing::Rng;
 
-    fn block(n: usize, normals: bool, uvs: bool) -> AttributeBlock {
+    fn block(n: usize, normals: bool, uvs: bool, attributes: bool) -> AttributeBlock {
         let mut rng = Rng(1);
         AttributeBlock {
             shapes: (0..n).map(|i| [3, 3, 7, 9][i * 4 / n.max(1)]).collect(),
             normals: if normals { (0..n).map(|_| [rng.direction().to_array(); 3]).collect() } else { Vec::new() },
             uvs: if uvs { (0..n).map(|_| [[rng.f32(), rng.f32()]; 3]).collect() } else { Vec::new() },
+            attributes: if attributes { (0..n).map(|_| [[rng.f32(); 3]; 3]).collect() } else { Vec::new() },
         }
     }
 
     #[test]
     fn bytes_come_back() {
         for n in [0, 1, 1000] {
-            for (normals, uvs) in [(false, false), (true, false), (false, true), (true, true)] {
-                let block = block(n, normals, uvs);
+            for has in 0..8 {
+                let block = block(n, has & 1 != 0, has & 2 != 0, has & 4 != 0);
                 assert_eq!(AttributeBlock::decode(&block.encode(), n as u32), Ok(block));
             }
         }
         // one run for equal neighbours
-        assert_eq!(block(1000, false, false).encode().len(), 16 + 3 * 8);
+        assert_eq!(block(1000, false, false, false).encode().len(), 16 + 3 * 8);
     }
 
     #[test]
     fn bad_bytes_are_refused() {
-        let good = block(20, true, true).encode();
+        let good = block(20, true, true, true).encode();
         for n in 0..good.len() {
             assert!(AttributeBlock::decode(&good[..n], 20).is_err());
         }
@@ -162,7 +169,8 @@ mod tests {
             match AttributeBlock::decode(&bad, 20) {
                 Ok(block) => {
                     assert_eq!(block.shapes.len(), 20);
-                    assert!([0, 20].contains(&block.normals.len()) && [0, 20].contains(&block.uvs.len()));
+                    let lengths = [block.normals.len(), block.uvs.len(), block.attributes.len()];
+                    assert!(lengths.iter().all(|n| [0, 20].contains(n)));
                 }
                 Err(_) => refused += 1,
             }
@@ -171,7 +179,7 @@ mod tests {
         // a header that asks for the most: refused before memory is taken
         let mut huge = good[..16].to_vec();
         huge[4..16].fill(0xff);
-        huge[4] = 3;
+        huge[4] = 7;
         huge[5..8].fill(0);
         assert!(matches!(AttributeBlock::decode(&huge, u32::MAX), Err(AttributeError::Length { .. })));
     }

@@ -1,10 +1,13 @@
 //! The small, global part of a prepared scene: materials, textures, shapes, lights. Every task holds it.
 
+use std::f32::consts::FRAC_1_PI;
+
+use glam::Vec3;
 use serde::{Deserialize, Serialize};
 
 use crate::material::Material;
 use crate::ray::PrimId;
-use crate::texture::{Bitmap, Texture};
+use crate::texture::{At, Bitmap, Texture};
 
 /// Materials, textures, shapes, emitters and sky of a scene, in recentred f32 coordinates.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -18,6 +21,9 @@ pub struct World {
     pub shapes: Vec<ShapeInfo>,
     /// Every primitive that emits, by ascending id.
     pub emissive: Vec<EmissivePrimitive>,
+    /// By ascending id: what those of them have whose shape's emission a texture gives.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub glows: Vec<Glow>,
     /// Light from points and single directions, which no ray comes upon.
     pub beams: Vec<Beam>,
     /// The sky, if any.
@@ -67,6 +73,16 @@ impl World {
             || self.emissive.iter().any(|e| e.shape as usize >= self.shapes.len())
         {
             return Err("it names shapes or materials that it lacks".into());
+        }
+        let slides = self.beams.iter().filter_map(|beam| match beam {
+            Beam::Spot { slide: Some(slide), .. } => Some(slide.texture),
+            _ => None,
+        });
+        if self.shapes.iter().filter_map(|s| s.emission_texture).chain(slides).any(|t| t as usize >= textures) {
+            return Err("a light names a texture that is not there".into());
+        }
+        if !self.glows.is_sorted_by(|a, b| a.prim < b.prim) {
+            return Err("what its textured lights have is out of order".into());
         }
         Ok(())
     }
@@ -128,6 +144,9 @@ pub enum Beam {
         beam: f32,
         /// Half angle beyond which it is dark, radians; from the inner cone on the intensity falls linearly with the angle.
         cutoff: f32,
+        /// A picture that it throws.
+        #[serde(default, skip_serializing_if = "Option::is_none")]
+        slide: Option<Slide>,
     },
     /// Parallel light from infinitely far away.
     Directional {
@@ -136,6 +155,26 @@ pub enum Beam {
         /// On a surface that faces it, W/m2.
         irradiance: [f32; 3],
     },
+}
+
+/// A texture in front of a spot light.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Slide {
+    /// Index into [`World::textures`]; its colour is a factor of the intensity.
+    pub texture: u32,
+    /// Rows of the map that turns a direction of the world into the light's: the third is along its axis.
+    pub to_local: [[f32; 3]; 3],
+    /// Tangent of the cone's half angle: so far along x or y at distance 1 texture coordinates are 0 and 1.
+    pub tan: f32,
+}
+
+impl Slide {
+    /// Texture coordinates of a direction away from the light.
+    #[inline]
+    pub fn uv(&self, d: Vec3) -> [f32; 2] {
+        let [x, y, z] = self.to_local.map(|row| Vec3::from(row).dot(d));
+        [x, y].map(|a| 0.5 + 0.5 * a / (z * self.tan))
+    }
 }
 
 /// What a hit needs to know about its shape.
@@ -147,6 +186,9 @@ pub struct ShapeInfo {
     pub material: u32,
     /// Radiance emitted from the front, if any.
     pub emission: Option<[f32; 3]>,
+    /// Index into [`World::textures`] of what that is multiplied by.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub emission_texture: Option<u32>,
 }
 
 /// A primitive of a shape that emits.
@@ -158,6 +200,44 @@ pub struct EmissivePrimitive {
     pub shape: u32,
     /// Where it is.
     pub geometry: Primitive,
+}
+
+/// What a primitive has whose emission a texture gives: enough to look it up at any of its points.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Glow {
+    /// Its global id.
+    pub prim: PrimId,
+    /// Texture coordinates of a triangle's vertices.
+    pub uv: Option<[[f32; 2]; 3]>,
+    /// The mesh's attribute at a triangle's vertices.
+    pub attribute: Option<[[f32; 3]; 3]>,
+    /// About the mean luminance of the texture on it, by which it is chosen; 0 only if the texture is dark everywhere.
+    pub weight: f32,
+}
+
+impl Glow {
+    /// Where the texture is looked up at a point of a triangle, by its barycentric coordinates of the second and third vertex.
+    #[inline]
+    pub fn on_triangle(&self, u: f32, v: f32) -> At {
+        At {
+            uv: self.uv.map_or([u, v], |uv| interpolated(&uv, u, v)),
+            attribute: self.attribute.map_or(Vec3::ZERO, |a| interpolated(&a, u, v).into()),
+        }
+    }
+}
+
+/// Values of a triangle's vertices at a point of it.
+#[inline(always)]
+pub(crate) fn interpolated<const N: usize>([a, b, c]: &[[f32; N]; 3], u: f32, v: f32) -> [f32; N] {
+    let w = 1.0 - u - v;
+    std::array::from_fn(|k| a[k] * w + b[k] * u + c[k] * v)
+}
+
+/// Texture coordinates of a sphere where its outward unit normal is `n`: longitude and colatitude from z, in [0, 1].
+pub fn sphere_uv(n: Vec3) -> [f32; 2] {
+    let turn = libm::atan2f(n.y, n.x) * (0.5 * FRAC_1_PI);
+    let v = libm::atan2f((n.x * n.x + n.y * n.y).sqrt(), n.z) * FRAC_1_PI;
+    [if turn < 0.0 { turn + 1.0 } else { turn }, v]
 }
 
 /// Geometry of one primitive, in recentred coordinates.

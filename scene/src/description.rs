@@ -74,7 +74,13 @@ pub enum Geometry {
         flip_v: bool,
         /// Where the file has no normals, smooth ones are computed (unless [`Shape::face_normals`]).
         smooth: bool,
+        /// What of the file's other properties is read as the mesh's attribute.
+        attribute: Option<MeshAttribute>,
+        /// What its `usemtl` statements mean (OBJ); they mean nothing if `None`.
+        parts: Option<Parts>,
     },
+    /// Part of the mesh file of a shape before it, by [`Parts`]: its triangles come with that file's.
+    Part,
     /// Triangles given in the description itself (rectangle, cube, disk, cylinder). Object space.
     Inline {
         /// Vertices.
@@ -100,6 +106,28 @@ pub enum Geometry {
         /// The value, in the volume's rescaled units (HU for CT).
         iso: f64,
     },
+}
+
+/// A property of a mesh's vertices or faces, of three numbers or of one that stands for three.
+#[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+pub struct MeshAttribute {
+    /// Of faces, not of vertices.
+    pub of_faces: bool,
+    /// Its name: `color` for `r g b` and `red green blue`, else what stands before `_x _y _z`.
+    pub name: String,
+    /// Whole numbers are sRGB, their largest value being 1; else they are taken as they are.
+    pub srgb: bool,
+}
+
+/// The materials that an OBJ file names.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Parts {
+    /// Names that `usemtl` may give, each once: the n-th (from 0) is that of the shape n + 1 places after the file's own.
+    pub names: Vec<String>,
+    /// What the `mtllib` statements say that were read.
+    pub libraries: Vec<String>,
+    /// Triangles of a name that is not there get the file's own shape; else such a name is an error.
+    pub lenient: bool,
 }
 
 /// Mesh file formats.
@@ -130,6 +158,8 @@ pub struct Shape {
     pub material: u32,
     /// Radiance emitted from the front side (W/sr/m2, linear RGB), if any.
     pub emission: Option<[f32; 3]>,
+    /// Index into [`Description::textures`] of what that is multiplied by.
+    pub emission_texture: Option<u32>,
     /// Front and back exchanged.
     pub flip_normals: bool,
     /// Shading normals of the file are not used.
@@ -163,6 +193,13 @@ pub enum TextureKind {
     },
     /// Squares of two colours.
     Checkerboard(Checkerboard),
+    /// The attribute of the mesh that it is on.
+    Attribute {
+        /// Its name in the source.
+        name: String,
+        /// What it is multiplied by.
+        scale: f32,
+    },
 }
 
 /// A camera in world space.
@@ -205,6 +242,8 @@ pub enum Beam {
         beam: f64,
         /// Half angle of the cone, degrees, at most 180; between the two the intensity falls linearly with the angle.
         cutoff: f64,
+        /// A picture that it throws.
+        slide: Option<Slide>,
     },
     /// Parallel light from infinitely far away.
     Directional {
@@ -213,6 +252,15 @@ pub enum Beam {
         /// On a surface that faces it, W/m2, linear RGB.
         irradiance: [f32; 3],
     },
+}
+
+/// A texture in front of a spot light; its borders lie on the cone.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Slide {
+    /// Index into [`Description::textures`].
+    pub texture: u32,
+    /// Rows of the map from directions of the world to the light's, whose z axis is the cone's.
+    pub to_local: [[f64; 3]; 3],
 }
 
 /// Light from infinitely far away, all around.
@@ -294,12 +342,24 @@ pub struct Description {
     pub hide_emitters: bool,
     /// What was replaced by a stand-in on request, for log and report.
     pub substitutions: Vec<Substitution>,
+    /// What was passed over because it says nothing that is computed here, or was read in a way that is not the only one.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub notes: Vec<Note>,
     /// World-space bounds of all primitives, if importing had to find them (to frame a scene without a camera).
     pub bounds: Option<[[f64; 3]; 2]>,
     /// Bytes of the source that importing itself read.
     pub bytes_read: u64,
     /// Passes over all shapes that importing itself made: one if it had to find the bounds by reading, else none.
     pub passes: u32,
+}
+
+/// Something that who brings a scene should know, and that is no error.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Note {
+    /// Where it stands.
+    pub place: Place,
+    /// What was done.
+    pub text: String,
 }
 
 /// Something unsupported that was replaced on request (`--substitute`).

@@ -2,6 +2,7 @@
 
 pub mod description;
 pub mod grid;
+pub mod house;
 pub mod image;
 pub mod import;
 pub mod inspect;

@@ -11,6 +11,8 @@ pub struct TriangleRecord {
     pub n: Option<[[f32; 3]; 3]>,
     /// Texture coordinates.
     pub uv: Option<[[f32; 2]; 3]>,
+    /// The mesh's attribute (a colour, say).
+    pub attribute: Option<[[f32; 3]; 3]>,
     /// Index into the description's shapes.
     pub shape: u32,
 }

@@ -27,6 +27,9 @@ const WORDS: &[&str] = &[
     "facet",
     "solid",
     "f 1 2 3",
+    "usemtl red",
+    "mtllib a.mtl",
+    "property uchar green",
     "v 1 1 1",
     "/dev/zero",
     "../a",
@@ -110,7 +113,17 @@ fn binary_ply(big: bool) -> Vec<u8> {
 
 #[test]
 fn ply() {
-    fuzz("a.ply", &[PLY.into(), binary_ply(false), binary_ply(true)], &[]);
+    // colours of vertices, and of faces
+    let bytes = "property uchar red\nproperty uchar green\nproperty uchar blue\n";
+    let colored = format!(
+        "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n{bytes}element face 1\n\
+         property list uchar int vertex_indices\nend_header\n0 0 0 1 2 3\n1 0 0 2 3 4\n0 2 0 3 4 5\n3 0 1 2\n"
+    );
+    let faces = format!(
+        "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\nelement face 2\n\
+         property list uchar int vertex_indices\n{bytes}end_header\n0 0 0\n1 0 0\n0 2 0\n3 0 1 2 7 8 9\n3 2 1 0 1 2 3\n"
+    );
+    fuzz("a.ply", &[PLY.into(), binary_ply(false), binary_ply(true), colored.into(), faces.into()], &[]);
 }
 
 #[test]
@@ -123,9 +136,9 @@ fn packed() {
 
 #[test]
 fn obj() {
-    let text = "mtllib a.mtl\no a\nv 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nvt 0.5 0.5\nvn 0 0 1\nf 1 2 3 4\nf -4/1 -3/1 \\\n-2/1\n\
+    let text = "mtllib a.mtl\no a\nv 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nvt 0.5 0.5\nvn 0 0 1\nusemtl red\nf 1 2 3 4\nusemtl blue\nf -4/1 -3/1 \\\n-2/1\n\
                 f 1//1 2//1 3//1\nf 1/1/1 2/1/1 4/1/1\n";
-    fuzz("a.obj", &[text.into()], &[]);
+    fuzz("a.obj", &[text.into()], &[("a.mtl", "newmtl red\nKd 1 0 0\nKe 1 1 1\nnewmtl blue\nillum 7\n")]);
 }
 
 #[test]
@@ -152,7 +165,9 @@ fn mitsuba() {
 <shape type="cube"><transform name="to_world"><matrix value="1 0 0 1 0 2 0 1 0 0 3 1 0 0 0 1"/><rotate x="1" angle="20"/></transform>
 <bsdf type="diffuse"><rgb name="reflectance" value="#102030"/></bsdf></shape>
 <shape type="rectangle"><emitter type="area"><rgb name="radiance" value="3"/></emitter></shape>
-<shape type="ply"><string name="filename" value="a.ply"/></shape></scene>"##;
+<shape type="ply"><string name="filename" value="a.ply"/></shape>
+<shape type="ply"><string name="filename" value="b.ply"/><bsdf type="diffuse"><texture type="mesh_attribute" name="reflectance">
+<string name="name" value="vertex_heat"/><float name="scale" value="0.5"/></texture></bsdf></shape></scene>"##;
     let part = r#"<scene><alias id="m" as="n"/><shape type="ply"><string name="filename" value="a.ply"/><ref id="n"/></shape></scene>"#;
     // lights, sensors and shapes that are laid out
     let more = r#"<scene version="3.0.0"><integrator type="path"><boolean name="hide_emitters" value="true"/></integrator>
@@ -163,12 +178,18 @@ fn mitsuba() {
 <transform name="toWorld"><rotate y="1" angle="30"/></transform></emitter>
 <emitter type="point"><point name="position" x="1" y="2" z="3"/><rgb name="intensity" value="1, 2, 3"/></emitter>
 <emitter type="spot"><transform name="to_world"><lookat origin="0,5,0" target="0,0,0" up="1,0,0"/></transform>
-<float name="cutoffAngle" value="30"/><float name="beamWidth" value="10"/></emitter>
+<float name="cutoffAngle" value="30"/><float name="beamWidth" value="10"/>
+<texture type="checkerboard" name="texture"><rgb name="color0" value="2, 0, 1"/></texture></emitter>
 <emitter type="directional"><vector name="direction" x="0" y="-1" z="0.5"/><float name="irradiance" value="2"/></emitter>
 <shape type="shapegroup" id="g"><shape type="sphere"/><shape type="ply"><string name="filename" value="a.ply"/></shape></shape>
 <shape type="instance"><ref id="g"/><transform name="to_world"><translate x="4"/></transform></shape>
 <shape type="instance"><ref id="g"/></shape><shape type="disk"/>
 <shape type="cylinder"><point name="p0" value="0 0 1"/><point name="p1" value="0 2 1"/><float name="radius" value="0.5"/></shape></scene>"#;
     let sky = "#?RGBE\nFORMAT=32-bit_rle_rgbe\n\n-Y 2 +X 2\nabc\u{7f}def\u{7f}ghi\u{7f}jkl\u{7f}";
-    fuzz("a.xml", &[text.into(), more.into()], &[("part.xml", part), ("a.ply", PLY), ("sky.hdr", sky)]);
+    let heated = PLY.replace("uchar red", "float heat_x");
+    fuzz(
+        "a.xml",
+        &[text.into(), more.into()],
+        &[("part.xml", part), ("a.ply", PLY), ("b.ply", &heated), ("sky.hdr", sky)],
+    );
 }

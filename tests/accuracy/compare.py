@@ -42,7 +42,7 @@ def main() -> int:
     groups = {"materials": scenes.MATERIALS, "emitters": scenes.EMITTERS}
     names = [n for name in a.names for n in groups.get(name, [name])]
     for name in names:
-        xml = scenes.prepare(name, a.shared.resolve(), a.work.resolve())
+        xml = scenes.prepare(name, a.shared.resolve(), a.work.resolve(), a.rayherd)
         other = scenes.theirs(xml) if scenes.theirs(xml).exists() else xml
         scene = mi.load_file(str(other), **scenes.parameters(xml, a.size, a.max_depth))
         spp, renders = (64, 8) if a.quick else scenes.ENOUGH.get(name, (256, 16))

@@ -5,7 +5,9 @@ import sys
 import tarfile
 from pathlib import Path
 
-NAMES = ["cornell", "veach-mis", "gyroid", "staircase", "living-room", "classroom", "dining-room"]
+NAMES = ["cornell", "veach-mis", "gyroid", "staircase", "living-room", "classroom", "dining-room", "furnace", "ajar-door", "still-life", "house"]
+# of ../../examples; house is made by `rayherd scene house`
+OURS = ["furnace", "ajar-door", "still-life"]
 # of ../shared/data, and which of their files: dining-room's other one lacks its sky
 ROOMS = {"staircase": "scene.xml", "living-room": "scene.xml", "classroom": "scene.xml", "dining-room": "scene_sunsky.xml"}
 # samples of one render and number of renders: three standard errors below 0.5 % of each channel's mean. Nearly all of veach-mis' noise is
@@ -64,6 +66,10 @@ ENVMAP = ('<emitter type="envmap"><string name="filename" value="sky.hdr"/><floa
 DISK = ('<shape type="disk"><transform name="to_world"><scale value="0.5"/><rotate x="1" angle="90"/><translate x="0.3" y="2.4"/></transform>'
         '<emitter type="area"><rgb name="radiance" value="12, 10, 8"/></emitter></shape>')
 FOV = '<float name="fov" value="40"/>'
+# a lamp, and a picture
+GLOW = ('<shape type="rectangle"><transform name="to_world"><scale x="0.8" y="0.5"/><rotate x="1" angle="90"/><translate x="0.3" y="2.4"/></transform>'
+        '<emitter type="area">RADIANCE</emitter></shape>')
+SLIDE = '<texture type="bitmap" name="NAME"><string name="filename" value="slide.hdr"/><string name="wrap_mode" value="clamp"/></texture>'
 # emitters; the sensor's type and what it has
 EMITTERS = {
     "envmap": (ENVMAP, "perspective", FOV),
@@ -84,6 +90,21 @@ EMITTERS = {
     "sky": ('<emitter type="sunsky"><vector name="sun_direction" x="-0.5" y="0.5" z="-0.3"/><float name="sun_scale" value="0"/>'
             '<transform name="to_world"><rotate x="1" angle="-90"/></transform></emitter>', "perspective", FOV),
     "disk": (DISK, "perspective", FOV),
+    "area-checkerboard": (GLOW.replace("RADIANCE", '<texture type="checkerboard" name="radiance"><spectrum name="color0" value="9"/>'
+                                       '<rgb name="color1" value="0.2, 0.5, 1"/><transform name="to_uv"><scale x="3" y="2"/></transform></texture>'),
+                          "perspective", FOV),
+    "area-bitmap": (GLOW.replace("RADIANCE", SLIDE.replace("NAME", "radiance")), "perspective", FOV),
+    "spot-texture": ('<emitter type="spot"><transform name="to_world"><lookat origin="1, 3, 1" target="-0.3, 0.3, 0" up="0, 1, 0"/></transform>'
+                     '<float name="cutoff_angle" value="30"/><float name="beam_width" value="25"/><rgb name="intensity" value="28, 26, 15"/>'
+                     + SLIDE.replace("NAME", "texture") + "</emitter>", "perspective", FOV),
+    # coloured sheets that reflect by their vertices and by their faces (Mitsuba 3.9 samples no lamp whose radiance is a mesh attribute: it is dark)
+    "mesh-attribute": (DISK + '<shape type="ply"><string name="filename" value="sheet.ply"/><transform name="to_world"><rotate x="1" angle="-20"/>'
+                       '<translate x="-0.3" y="0.9" z="-0.9"/></transform><bsdf type="twosided"><bsdf type="diffuse"><texture '
+                       'type="mesh_attribute" name="reflectance"><string name="name" value="vertex_color"/></texture></bsdf></bsdf></shape>'
+                       '<shape type="ply"><string name="filename" value="sheet.ply"/><transform name="to_world"><scale value="0.6"/>'
+                       '<rotate y="1" angle="-40"/><translate x="1.3" y="1.2" z="-0.5"/></transform><bsdf type="twosided"><bsdf '
+                       'type="diffuse"><texture type="mesh_attribute" name="reflectance"><string name="name" value="face_glow"/>'
+                       '<float name="scale" value="0.4"/></texture></bsdf></bsdf></shape>', "perspective", FOV),
     "thinlens": (DISK, "thinlens", FOV + '<float name="aperture_radius" value="0.3"/><float name="focus_distance" value="4"/>'),
     "orthographic": (DISK, "orthographic", ""),
     "instances": (ENVMAP + '<shape type="shapegroup" id="g"><shape type="sphere"><float name="radius" value="0.2"/></shape>'
@@ -113,21 +134,37 @@ EMITTER
 """
 
 
-def sky() -> bytes:
-    """A picture of 64 x 32 pixels in RGBE: patches of colour, dark ones among them, and a small sun."""
+def sky(with_sun: bool = True) -> bytes:
+    """A picture of 64 x 32 pixels in RGBE: patches of colour, dark ones among them, and perhaps a small sun."""
     rows = bytearray(b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 32 +X 64\n")
     for y in range(32):
         for x in range(64):
             a, b, c = (x * 37 + y * 91) % 256, (x * 11 + y * 57 + 80) % 256, (x * 73 + y * 23 + 160) % 256
             if a > b > c:
                 a = b = c = 0
-            sun = (x, y) in [(20, 8), (20, 9)]
+            sun = with_sun and (x, y) in [(20, 8), (20, 9)]
             # no pixel begins with 2, 2 or is 1, 1, 1, which would be a run
             rows += bytes([200, 180, 150, 137]) if sun else bytes([a | 4, b | 4, c | 4, 128])
     return bytes(rows)
 
 
-def prepare(name: str, shared: Path, work: Path) -> Path:
+def sheet() -> str:
+    """A PLY of 5 x 5 quads, two units wide, front to +z, whose vertices and faces have colours."""
+    n = 6
+    out = ["ply", "format ascii 1.0", f"element vertex {n * n}"]
+    out += [f"property float {p}" for p in ("x", "y", "z", "r", "g", "b")]
+    out += [f"element face {2 * (n - 1) ** 2}", "property list uchar int vertex_indices"]
+    out += [f"property float glow_{p}" for p in "xyz"] + ["end_header"]
+    for i in range(n * n):
+        s, t = (i % n) / (n - 1), (i // n) / (n - 1)
+        out.append(f"{2 * s - 1} {2 * t - 1} 0 {s} {t} {1 - s * t}")
+    for i in (i for i in range(n * (n - 1)) if i % n < n - 1):
+        glow = f"{(i * 7 % 5) / 2} {(i * 3 % 4) / 2} {(i * 5 % 3)}"
+        out += [f"3 {i} {i + 1} {i + n + 1} {glow}", f"3 {i} {i + n + 1} {i + n} {glow}"]
+    return "\n".join(out) + "\n"
+
+
+def prepare(name: str, shared: Path, work: Path, rayherd: str = "rayherd") -> Path:
     """Leaves the scene under `work` and returns its XML. Parameters: res (or resx, resy), spp, max_depth."""
     if name == "cornell":
         out = work / "cornell.xml"
@@ -169,6 +206,13 @@ def prepare(name: str, shared: Path, work: Path) -> Path:
         if not out.exists():  # 1,002,500 triangles
             subprocess.run([sys.executable, shared / "peers/make_scene.py", "148"], cwd=work, check=True)
         return out
+    if name in OURS:
+        out = work / f"{name}.xml"
+        out.write_text((Path(__file__).resolve().parents[2] / f"examples/{name}.xml").read_text())
+        return out
+    if name == "house":
+        subprocess.run([rayherd, "scene", "house", "--size", "2", work / "house"], check=True, stdout=subprocess.DEVNULL)
+        return work / "house/house.xml"
     if name in MATERIALS:
         out = work / f"material-{name}.xml"
         out.write_text(SMALL.replace("MATERIAL", MATERIALS[name]))
@@ -176,6 +220,8 @@ def prepare(name: str, shared: Path, work: Path) -> Path:
     if name in EMITTERS:
         emitter, sensor, lens = EMITTERS[name]
         (work / "sky.hdr").write_bytes(sky())
+        (work / "slide.hdr").write_bytes(sky(with_sun=False))
+        (work / "sheet.ply").write_text(sheet())
         out = work / f"emitter-{name}.xml"
         text = LIT.replace("SENSOR", sensor).replace("LENS", lens).replace("EMITTER", emitter)
         # a scale of the map is the width of a parallel view; a perspective one has none

@@ -46,6 +46,7 @@ pub fn run(arguments: &Arguments) -> anyhow::Result<ExitCode> {
         if spec.scene.substitute { tracing::info!("{line}") } else { problems.push(line) }
     }
     print(&text)?;
+    description.notes.iter().for_each(|note| eprintln!("{}: {}", note.place, note.text));
     problems.iter().for_each(|p| eprintln!("{p}"));
     if problems.is_empty() {
         return Ok(ExitCode::SUCCESS);
@@ -106,6 +107,10 @@ fn tell(scene: &str, description: &Description, survey: &Survey) -> String {
         };
         line("camera", format!("{kind}, {w}x{h}{part}"));
     }
+    let with_attribute = survey.sum(|s| s.with_attribute);
+    if with_attribute > 0 {
+        line("colours", format!("{} with a mesh attribute", count(with_attribute, "triangle")));
+    }
     let total = survey.prepared_bytes();
     line(
         "prepared",
@@ -155,6 +160,7 @@ fn geometry(geometry: &Geometry) -> &'static str {
     match geometry {
         Geometry::MeshFile { format: MeshFormat::Ply, .. } => "ply",
         Geometry::MeshFile { format: MeshFormat::Obj, .. } => "obj",
+        Geometry::Part => "part of an obj",
         Geometry::MeshFile { format: MeshFormat::Stl, .. } => "stl",
         Geometry::MeshFile { format: MeshFormat::Serialized(_), .. } => "serialized",
         Geometry::Inline { .. } => "rectangle, cube, disk or cylinder",
@@ -167,6 +173,7 @@ fn texture(kind: &TextureKind) -> &'static str {
     match kind {
         TextureKind::Image { .. } => "image",
         TextureKind::Checkerboard(_) => "checkerboard",
+        TextureKind::Attribute { .. } => "mesh attribute",
     }
 }
 

@@ -50,7 +50,7 @@ impl PreparedScene {
         let mut sizes = world.textures.iter().flat_map(|texture| {
             let of = |n| match texture {
                 Texture::Bitmap(bitmap) => bitmap.tile_bytes(n),
-                Texture::Checkerboard(_) => 0,
+                Texture::Checkerboard(_) | Texture::Attribute { .. } => 0,
             };
             texture.tiles().map(of)
         });

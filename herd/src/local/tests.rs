@@ -461,7 +461,7 @@ fn every_emitter_makes_the_same_bytes() {
     let description = rayherd_scene::description::Description {
         beams: vec![
             Beam::Point { position, intensity },
-            Beam::Spot { position, axis, intensity: [3.0; 3], beam: 20.0, cutoff: 50.0 },
+            Beam::Spot { position, axis, intensity: [3.0; 3], beam: 20.0, cutoff: 50.0, slide: None },
             Beam::Directional { direction: [0.0, -0.6, -0.8], irradiance: [1.0, 0.9, 0.8] },
         ],
         environment: Some(Environment::Map { path, place: Place::default(), scale: 0.25, to_world: turned }),

@@ -7,8 +7,9 @@ use rayherd_render::camera::Camera;
 use rayherd_render::filter::Filter;
 use rayherd_render::frame::Frame;
 use rayherd_scene::description::{
-    Affine, Amount, Bsdf, Checkerboard, Description, Detail, Distribution, Environment, Geometry, Material, Place,
-    Relief, ReliefKind, Shape, Slot, TexelFilter, Texture, TextureKind, Textured, Transmittance, UvMap, Wrap,
+    Affine, Amount, Bsdf, Checkerboard, Description, Detail, Distribution, Environment, Geometry, Material,
+    MeshAttribute, MeshFormat, Place, Relief, ReliefKind, Shape, Slot, TexelFilter, Texture, TextureKind, Textured,
+    Transmittance, UvMap, Wrap,
 };
 use rayherd_scene::import::{DescriptionSource, StreamOptions};
 use rayherd_scene::objects::MemoryObjects;
@@ -45,6 +46,7 @@ fn shape(name: &str, geometry: Geometry, material: u32, emission: Option<[f32; 3
         to_world: Affine::IDENTITY,
         material,
         emission,
+        emission_texture: None,
         flip_normals: false,
         face_normals: false,
     }
@@ -97,13 +99,33 @@ pub fn cornell() -> Description {
         rr_depth: None,
         hide_emitters: false,
         substitutions: vec![],
+        notes: vec![],
         bounds: None,
         bytes_read: 0,
         passes: 0,
     }
 }
 
-/// The box with pictures on its walls, holes, bumps and a textured coat; its files lie in the folder.
+/// A sheet in the middle of the box whose vertices have colours, as a PLY file of this path.
+fn colored_sheet(path: &Path) {
+    const N: usize = 12;
+    let mut text = format!(
+        "ply\nformat ascii 1.0\nelement vertex {}\nproperty float x\nproperty float y\nproperty float z\nproperty float r\n\
+         property float g\nproperty float b\nelement face {}\nproperty list uchar int vertex_indices\nend_header\n",
+        N * N,
+        (N - 1) * (N - 1)
+    );
+    for i in 0..N * N {
+        let [s, t] = [i % N, i / N].map(|k| k as f64 / (N - 1) as f64);
+        text += &format!("{} {} {} {s} {t} {}\n", s - 0.5, t - 0.6, 0.2 * s * t, 1.0 - s);
+    }
+    for i in (0..N * (N - 1)).filter(|i| i % N < N - 1) {
+        text += &format!("4 {} {} {} {}\n", i, i + 1, i + N + 1, i + N);
+    }
+    std::fs::write(path, text).unwrap();
+}
+
+/// The box with pictures on its walls and in its lamp, holes, bumps, a textured coat and a coloured mesh; its files lie in the folder.
 pub fn textured(folder: &Path) -> Description {
     let path = folder.join("wall.png");
     let mut png = Vec::new();
@@ -137,7 +159,7 @@ pub fn textured(folder: &Path) -> Description {
             *uv = (0..positions.len()).map(at).collect();
         }
     }
-    let painted = |texture| vec![Textured { slot: Slot::Diffuse, texture }];
+    let painted = |texture| vec![Textured::new(Slot::Diffuse, texture)];
     let coat = Transmittance::new(Distribution::Ggx, 0.2, 1.5);
     let plastic = Bsdf::RoughPlastic {
         distribution: Distribution::Ggx,
@@ -163,6 +185,27 @@ pub fn textured(folder: &Path) -> Description {
     for (i, shape) in (0..).zip(out.shapes.iter_mut().filter(|s| s.emission.is_none())) {
         shape.material = first + i % 4;
     }
+    for shape in out.shapes.iter_mut().filter(|s| s.emission.is_some()) {
+        shape.emission_texture = Some(0);
+    }
+    let sheet = folder.join("sheet.ply");
+    colored_sheet(&sheet);
+    out.textures.push(Texture {
+        place: Place::default(),
+        kind: TextureKind::Attribute { name: "vertex_color".into(), scale: 0.9 },
+    });
+    let detail = Detail { textured: painted(3), ..Detail::default() };
+    let bsdf = Bsdf::Diffuse { reflectance: [0.5; 3] };
+    out.materials.push(Material { detail: Some(Box::new(detail)), ..material("coloured", bsdf) });
+    let geometry = Geometry::MeshFile {
+        path: sheet,
+        format: MeshFormat::Ply,
+        flip_v: false,
+        smooth: false,
+        attribute: Some(MeshAttribute { of_faces: false, name: "color".into(), srgb: false }),
+        parts: None,
+    };
+    out.shapes.push(shape("sheet", geometry, out.materials.len() as u32 - 1, None));
     out
 }
 

@@ -42,7 +42,7 @@ fn unlimited(beam: &Beam, o: Vec3) -> Option<(Vec3, f32, Vec3)> {
             let (d, tmax, falloff) = towards(o, position.into())?;
             Some((d, tmax, Vec3::from(intensity) * falloff))
         }
-        Beam::Spot { position, axis, intensity, beam, cutoff } => {
+        Beam::Spot { position, axis, intensity, beam, cutoff, .. } => {
             let (d, tmax, falloff) = towards(o, position.into())?;
             // by the chord, which keeps small angles exact
             let sine = 0.5 * (Vec3::from(axis) + d).length();

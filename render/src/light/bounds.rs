@@ -58,7 +58,7 @@ impl Bounds {
             Geometry::Beam(Beam::Point { position, intensity }) => {
                 Some(around(Vec3::from(*position), 0.0, f64::from(luminance(Vec3::from(*intensity)))))
             }
-            Geometry::Beam(Beam::Spot { position, axis, intensity, beam, cutoff }) => Some(Bounds {
+            Geometry::Beam(Beam::Spot { position, axis, intensity, beam, cutoff, .. }) => Some(Bounds {
                 axis: Vec3::from(*axis).as_dvec3(),
                 normals: f64::from(*beam),
                 emission: f64::from(*cutoff) - f64::from(*beam),

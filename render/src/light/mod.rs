@@ -27,7 +27,8 @@ use glam::Vec3;
 
 use crate::math::{luminance, unit};
 use crate::ray::PrimId;
-use crate::world::{Beam, Primitive, World};
+use crate::texture::At;
+use crate::world::{Beam, Glow, Primitive, World, sphere_uv};
 use bounds::Bounds;
 pub use map::{SkyMap, SkyMapError};
 use sky::Sky;
@@ -57,8 +58,9 @@ pub struct Lights {
     sky: Sky,
     sky_probability: f32,
     only_triangles: bool,
-    /// The sources once more, if they are triangles and at most [`FEW`]: in the order of the tree's only node, if there is a tree.
+    /// The sources once more, if they are even triangles and at most [`FEW`]: in the order of the tree's only node, if there is a tree.
     few: Vec<FewTriangles>,
+    pictures: Vec<Picture>,
 }
 
 /// All sources, where they are triangles and few.
@@ -87,10 +89,21 @@ pub(crate) struct FewTriangles {
 #[derive(Clone, Debug)]
 struct Source {
     geometry: Geometry,
-    /// Of the sky its mean.
+    /// Of the sky, and where a texture gives it, about its mean.
     emission: Vec3,
     /// With which it is chosen; what the integers in `Lights::ends` say. Of the tree's sources 0: it depends on the point.
     probability: f32,
+    /// Number in `Lights::pictures`, if a texture gives the emission.
+    picture: Option<u32>,
+}
+
+/// The emission of a source that a texture gives.
+#[derive(Clone, Debug)]
+struct Picture {
+    texture: u32,
+    /// What the texture is multiplied by.
+    factor: Vec3,
+    glow: Glow,
 }
 
 /// What a number chose.
@@ -118,6 +131,8 @@ pub struct LightSample {
     pub tmax: f32,
     /// Radiance arriving from there if nothing is in between. Of a single direction: irradiance times 2^64.
     pub radiance: Vec3,
+    /// A texture that this is multiplied by, and where it is looked up.
+    pub look: Option<(u32, At)>,
     /// Density in solid angle, the choice included. Of a single direction: 2^64 times the choice's probability, so that `radiance / pdf` is
     /// right and no other technique's density counts beside it.
     pub pdf: f32,
@@ -152,10 +167,18 @@ impl Lights {
         let mut by_prim = Vec::new();
         let mut areas = vec![0.0f64; world.shapes.len()];
         let mut chosen = Vec::new();
+        let mut pictures = Vec::new();
         for e in &world.emissive {
-            let Some(emission) = world.shapes.get(e.shape as usize).and_then(|s| s.emission).map(Vec3::from) else {
-                continue;
-            };
+            let Some(shape) = world.shapes.get(e.shape as usize) else { continue };
+            let Some(factor) = shape.emission.map(Vec3::from) else { continue };
+            let glow = shape.emission_texture.map(|texture| {
+                let found = world.glows.binary_search_by_key(&e.prim, |g| g.prim);
+                // a world without it was not made by preparing: the hit's own coordinates
+                let none = Glow { prim: e.prim, uv: None, attribute: None, weight: 1.0 };
+                Picture { texture, factor, glow: found.map_or(none, |i| world.glows[i]) }
+            });
+            let weight = glow.as_ref().map_or(1.0, |p| p.glow.weight);
+            let emission = factor * weight;
             let geometry = match e.geometry {
                 Primitive::Triangle(v) => Geometry::Triangle(TriangleLight::new(v)),
                 Primitive::Sphere { center, radius, flipped } => {
@@ -166,10 +189,16 @@ impl Lights {
             if !(area > 0.0 && area.is_finite() && luminance(emission) > 0.0) {
                 continue;
             }
+            // a primitive's share of its shape is by area, and by what the texture has on it
+            let area = area * f64::from(weight);
             areas[e.shape as usize] += area;
             by_prim.push((e.prim, sources.len() as u32));
             chosen.push((e.shape as usize, area));
-            sources.push(Source { geometry, emission, probability: 0.0 });
+            let picture = glow.map(|picture| {
+                pictures.push(picture);
+                pictures.len() as u32 - 1
+            });
+            sources.push(Source { geometry, emission, probability: 0.0, picture });
         }
         by_prim.sort_unstable();
         let sky = Sky::new(world, map);
@@ -189,16 +218,21 @@ impl Lights {
         let parts = shapes.len() + local.len();
         for (beam, power) in local.into_iter().chain(far) {
             weights.push(share(power));
-            sources.push(Source { geometry: Geometry::Beam(beam), emission: Vec3::ZERO, probability: 0.0 });
+            sources.push(Source {
+                geometry: Geometry::Beam(beam),
+                emission: Vec3::ZERO,
+                probability: 0.0,
+                picture: None,
+            });
         }
         if let Some(mean) = sky.mean() {
             weights.push(sky_share);
-            sources.push(Source { geometry: Geometry::Sky, emission: mean, probability: 0.0 });
+            sources.push(Source { geometry: Geometry::Sky, emission: mean, probability: 0.0, picture: None });
         }
         let bounds: Vec<Bounds> = sources.iter().map_while(Bounds::new).collect();
         let (mut tree, mut in_tree) = (None, 0);
         let mut ends = Vec::new();
-        let only_triangles = !sources.is_empty() && sources.iter().all(|s| matches!(s.geometry, Geometry::Triangle(_)));
+        let only_triangles = !sources.is_empty() && sources.iter().all(Source::is_even_triangle);
         let is_few = only_triangles && sources.len() <= FEW;
         if wants_tree(bounds.len(), parts) {
             in_tree = bounds.len();
@@ -221,7 +255,7 @@ impl Lights {
             None => few_triangles(&sources, &ends),
             Some(tree) => children(&sources, tree.root()),
         };
-        Lights { sources, tree, ends, in_tree, by_prim, sky, sky_probability, only_triangles, few }
+        Lights { sources, tree, ends, in_tree, by_prim, sky, sky_probability, only_triangles, few, pictures }
     }
 
     /// The same, but that no source is left out where it cannot shine: to see what leaving them out saves.
@@ -269,33 +303,49 @@ impl Lights {
             Geometry::Beam(beam) => {
                 let (d, tmax, irradiance) = beam::sample(beam, o)?;
                 let radiance = irradiance * beam::SINGLE;
-                return Some(LightSample { d, tmax, radiance, pdf: beam::SINGLE * probability });
+                let look = match beam {
+                    Beam::Spot { slide: Some(slide), .. } => Some((slide.texture, At::uv(slide.uv(-d)))),
+                    _ => None,
+                };
+                return Some(LightSample { d, tmax, radiance, look, pdf: beam::SINGLE * probability });
             }
             Geometry::Sky => {
                 let (d, radiance, pdf) = self.sky.sample(place)?;
-                return Some(LightSample { d, tmax: f32::INFINITY, radiance, pdf: pdf * probability });
+                return Some(LightSample { d, tmax: f32::INFINITY, radiance, look: None, pdf: pdf * probability });
             }
         };
-        Some(LightSample { d, tmax, radiance: source.emission, pdf: pdf * probability })
+        let pdf = pdf * probability;
+        let Some(picture) = source.picture else {
+            return Some(LightSample { d, tmax, radiance: source.emission, look: None, pdf });
+        };
+        let picture = &self.pictures[picture as usize];
+        let at = match &source.geometry {
+            Geometry::Sphere(s) => At::uv(sphere_uv(s.normal(o, d))),
+            _ => {
+                let [s, t] = triangle::barycentric(u);
+                picture.glow.on_triangle(s, t)
+            }
+        };
+        Some(LightSample { d, tmax, radiance: picture.factor, look: Some((picture.texture, at)), pdf })
     }
 
-    /// A source that was chosen, if it is a triangle, and its radiance.
+    /// A source that was chosen, if it is an even triangle, and its radiance.
     #[inline(always)]
     pub(crate) fn triangle(&self, choice: Choice) -> Option<(&TriangleLight, Vec3)> {
         let source = &self.sources[choice.source];
         match &source.geometry {
-            Geometry::Triangle(t) => Some((t, source.emission)),
+            Geometry::Triangle(t) if source.picture.is_none() => Some((t, source.emission)),
             _ => None,
         }
     }
 
-    /// Whether every source is a triangle.
+    /// Whether every source is a triangle that emits evenly.
     #[inline(always)]
     pub(crate) fn only_triangles(&self) -> bool {
         self.only_triangles
     }
 
-    /// All sources, if they are triangles and few.
+    /// All sources, if they are even triangles and few.
     #[inline(always)]
     pub(crate) fn few_triangles(&self) -> Option<Few<'_>> {
         match &self.tree {
@@ -344,6 +394,12 @@ impl Lights {
         let source = self.in_tree + i;
         let choice = (i < self.ends.len()).then(|| Choice { source, probability: self.sources[source].probability });
         (choice, false)
+    }
+}
+
+impl Source {
+    fn is_even_triangle(&self) -> bool {
+        matches!(self.geometry, Geometry::Triangle(_)) && self.picture.is_none()
     }
 }
 

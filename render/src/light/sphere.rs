@@ -95,6 +95,17 @@ impl SphereLight {
         Some((d, (t - slack).max(0.0), 1.0 / (2.0 * PI * cone)))
     }
 
+    /// Outward unit normal where a direction from `o`, which [`SphereLight::sample`] gave, meets it first on the side that emits.
+    pub(super) fn normal(&self, o: Vec3, d: Vec3) -> Vec3 {
+        let to_center = self.center - o;
+        let along = to_center.dot(d);
+        let aside = (to_center - d * along).length_squared();
+        let half = (self.radius * self.radius - aside).max(0.0).sqrt();
+        let t = if self.flipped { along + half } else { along - half };
+        let n = d * t - to_center;
+        n / n.length()
+    }
+
     /// Density in solid angle, from `o`, of the direction that met the front at distance `t` and cosine `cos`.
     #[inline]
     pub(super) fn pdf(&self, o: Vec3, t: f32, cos: f32) -> f32 {

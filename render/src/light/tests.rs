@@ -13,7 +13,7 @@ pub(super) fn world(primitives: &[(Primitive, u32)], radiances: &[f32], environm
         materials: vec![Material::new("", Bsdf::Diffuse { reflectance: [0.5; 3] }, true)],
         shapes: radiances
             .iter()
-            .map(|&r| ShapeInfo { name: String::new(), material: 0, emission: Some([r; 3]) })
+            .map(|&r| ShapeInfo { name: String::new(), material: 0, emission: Some([r; 3]), emission_texture: None })
             .collect(),
         emissive: primitives
             .iter()
@@ -135,6 +135,64 @@ fn both_sides_agree() {
         found += 1;
     }
     assert!(found > 60_000, "{found}");
+}
+
+/// What a sample looks up is what the surface has where the sample's direction meets it; weights share the choice within a shape.
+#[test]
+fn textured_samples_look_where_they_point() {
+    let v = [[-1.0, 2.0, -1.0], [1.0, 2.0, -1.0], [0.0, 2.0, 1.5]];
+    let (center, radius) = ([0.5, -1.0, 0.25], 0.4);
+    let inside = Primitive::Sphere { center: [0.0; 3], radius: 6.0, flipped: true };
+    let ball = Primitive::Sphere { center, radius, flipped: false };
+    let mut world = world(&[(Primitive::Triangle(v), 0), (ball, 0), (inside, 0)], &[2.0], None);
+    world.shapes[0].emission_texture = Some(0);
+    let (uv, attribute) = ([[0.0, 0.0], [2.0, 0.0], [0.0, 3.0]], [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]);
+    world.glows = vec![Glow { prim: 10, uv: Some(uv), attribute: Some(attribute), weight: 3.0 }];
+    let lights = Lights::by_power(&world, None);
+    let mut rng = Rng(9);
+    let mut seen = [0; 3];
+    for _ in 0..20_000 {
+        let o = Vec3::new(rng.range(-3.0, 3.0), rng.range(-3.0, 1.9), rng.range(-3.0, 3.0));
+        let choice = rng.u32();
+        let Some(s) = lights.sample(o, choice, [rng.u32(), rng.u32()]) else { continue };
+        let Some((0, at)) = s.look else { panic!("{s:?}") };
+        assert_eq!(s.radiance, Vec3::splat(2.0));
+        let source = lights.choose(o, choice).0.unwrap().source;
+        seen[source] += 1;
+        let (o, d) = (o.as_dvec3(), s.d.as_dvec3());
+        if source == 0 {
+            let p = o + d * ((2.0 - o.y) / d.y);
+            // p = p0 + u e1 + v e2, and e2 alone goes along z
+            let w = (p.z + 1.0) / 2.5;
+            let u = (p.x + 1.0 - w) / 2.0;
+            assert!(
+                (f64::from(at.uv[0]) - 2.0 * u).abs() < 1e-4 && (f64::from(at.uv[1]) - 3.0 * w).abs() < 1e-4,
+                "{at:?} {u} {w}"
+            );
+            assert!((at.attribute.as_dvec3() - glam::DVec3::new(1.0 - u - w, u, w)).length() < 1e-4);
+            continue;
+        }
+        let (c, r) =
+            if source == 1 { (Vec3::from(center).as_dvec3(), f64::from(radius)) } else { (glam::DVec3::ZERO, 6.0) };
+        let f = o - c;
+        let (b, q) = (f.dot(d), f.length_squared() - r * r);
+        let root = (b * b - q).max(0.0).sqrt();
+        let t = if source == 1 { -b - root } else { -b + root };
+        let n = (f + d * t) / r;
+        let expected = sphere_uv(n.as_vec3());
+        // at the rim of the sphere, and at its poles, an error of the direction is a larger one on it
+        let slope = root / r;
+        if slope < 0.1 || n.x.hypot(n.y) < 0.1 {
+            continue;
+        }
+        let around = (at.uv[0] - expected[0]).abs();
+        assert!(around.min(1.0 - around) < 1e-4 && (at.uv[1] - expected[1]).abs() < 1e-4, "{at:?} {expected:?}");
+    }
+    assert!(seen.iter().all(|n| *n > 50), "{seen:?}");
+    // by area times weight: the triangle counts three times
+    let area = |s: usize| f64::from(lights.sources[s].geometry.area());
+    let share = |s: usize| f64::from(lights.sources[s].probability) / (area(s) * if s == 0 { 3.0 } else { 1.0 });
+    assert!((share(0) / share(1) - 1.0).abs() < 1e-5 && (share(0) / share(2) - 1.0).abs() < 1e-5);
 }
 
 /// The density, found by the geometry of the ray that goes to the sample, equals the sample's to rounding.

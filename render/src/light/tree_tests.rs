@@ -33,7 +33,14 @@ fn motley(n: usize, rng: &mut Rng) -> World {
                 let beam = rng.range(0.01, 1.0);
                 let cutoff = beam + rng.range(0.01, 1.5);
                 let axis = rng.direction().into();
-                beams.push(Beam::Spot { position: at.into(), axis, intensity: [strength; 3], beam, cutoff });
+                beams.push(Beam::Spot {
+                    position: at.into(),
+                    axis,
+                    intensity: [strength; 3],
+                    beam,
+                    cutoff,
+                    slide: None,
+                });
             }
         }
     }

@@ -20,6 +20,13 @@ pub struct TriangleLight {
 /// Error of a direction: what snapping and normalising turn it by, in radians (the former below 1e-7, the latter below gamma(3)).
 const TURN: f32 = 1e-7 + gamma(3);
 
+/// Of a point that is uniform over a triangle for two numbers in [0, 1): barycentric coordinates of the second and third vertex.
+#[inline(always)]
+pub(super) fn barycentric(u: [f32; 2]) -> [f32; 2] {
+    let root = u[0].sqrt();
+    [root * (1.0 - u[1]), root * u[1]]
+}
+
 impl TriangleLight {
     /// From its vertices, counter-clockwise from the front.
     pub fn new(v: [[f32; 3]; 3]) -> TriangleLight {
@@ -54,8 +61,8 @@ impl TriangleLight {
     /// The same without branches; the last says whether the rest counts.
     #[inline(always)]
     pub(crate) fn sample_or_not(&self, o: Vec3, u: [f32; 2]) -> (Vec3, f32, f32, bool) {
-        let root = u[0].sqrt();
-        let p = self.p0 + self.e1 * (root * (1.0 - u[1])) + self.e2 * (root * u[1]);
+        let [s, t] = barycentric(u);
+        let p = self.p0 + self.e1 * s + self.e2 * t;
         let way = p - o;
         let distance2 = way.length_squared();
         let distance = distance2.sqrt();

@@ -2,10 +2,11 @@
 //!
 //! A material without any of it has no detail and pays for none. Else a hit looks up what it needs and goes on with a plain [`Bsdf`].
 
+use glam::Vec3;
 use serde::{Deserialize, Serialize};
 
 use super::{Bsdf, Material, Principled};
-use crate::texture::{Texture, Textures};
+use crate::texture::{At, Texture, Textures};
 
 /// A parameter of a [`Bsdf`] that a texture may give.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -51,6 +52,24 @@ pub struct Textured {
     pub slot: Slot,
     /// Index into [`crate::world::World::textures`].
     pub texture: u32,
+    /// What its colour is multiplied by; a number by the first.
+    #[serde(default = "ones", skip_serializing_if = "is_ones")]
+    pub scale: [f32; 3],
+}
+
+impl Textured {
+    /// A texture as it is.
+    pub fn new(slot: Slot, texture: u32) -> Textured {
+        Textured { slot, texture, scale: ones() }
+    }
+}
+
+fn ones() -> [f32; 3] {
+    [1.0; 3]
+}
+
+fn is_ones(scale: &[f32; 3]) -> bool {
+    *scale == ones()
 }
 
 /// A number, or a texture that gives it.
@@ -139,12 +158,12 @@ impl Detail {
 }
 
 impl Amount {
-    /// Its value at texture coordinates, brought into [0, 1].
+    /// Its value at a place, brought into [0, 1].
     #[inline]
-    pub fn share(self, textures: &[Texture], tiles: &dyn Textures, uv: [f32; 2]) -> f32 {
+    pub fn share(self, textures: &[Texture], tiles: &dyn Textures, at: At) -> f32 {
         match self {
             Amount::Constant(x) => x,
-            Amount::Texture(n) => share(textures[n as usize].amount(tiles, uv)),
+            Amount::Texture(n) => share(textures[n as usize].amount(tiles, at)),
         }
     }
 }
@@ -155,22 +174,28 @@ fn share(x: f32) -> f32 {
     if x > 0.0 { x.min(1.0) } else { 0.0 }
 }
 
+/// A colour times a factor, brought into [0, 1].
+#[inline(always)]
+fn scaled(color: Vec3, scale: [f32; 3]) -> [f32; 3] {
+    (color * Vec3::from(scale)).to_array().map(share)
+}
+
 impl Material {
-    /// The model at texture coordinates. Colours are brought into [0, 1] and roughness to at most 1.
+    /// The model at a place. Colours are brought into [0, 1] and roughness to at most 1.
     #[inline(never)]
-    pub fn at(&self, detail: &Detail, textures: &[Texture], tiles: &dyn Textures, uv: [f32; 2]) -> Bsdf {
+    pub fn at(&self, detail: &Detail, textures: &[Texture], tiles: &dyn Textures, at: At) -> Bsdf {
         let mut bsdf = self.bsdf.clone();
-        for &Textured { slot, texture } in &detail.textured {
+        for &Textured { slot, texture, scale } in &detail.textured {
             let texture = &textures[texture as usize];
             match slot {
                 Slot::Diffuse | Slot::Specular | Slot::Transmit => {
                     if let Some(place) = bsdf.color_mut(slot) {
-                        *place = texture.color(tiles, uv).to_array().map(share);
+                        *place = scaled(texture.color(tiles, at), scale);
                     }
                 }
                 Slot::Alpha | Slot::AlphaU | Slot::AlphaV => {
                     if let Some(alpha) = bsdf.alpha_mut() {
-                        let value = share(texture.amount(tiles, uv));
+                        let value = share(texture.amount(tiles, at) * scale[0]);
                         match slot {
                             Slot::AlphaU => alpha[0] = value,
                             Slot::AlphaV => alpha[1] = value,
@@ -180,7 +205,7 @@ impl Material {
                 }
                 _ => {
                     if let Some(place) = bsdf.number_mut(slot) {
-                        *place = share(texture.amount(tiles, uv));
+                        *place = share(texture.amount(tiles, at) * scale[0]);
                     }
                 }
             }
@@ -188,18 +213,12 @@ impl Material {
         bsdf
     }
 
-    /// The albedo at texture coordinates, of a diffuse material.
+    /// The albedo at a place, of a diffuse material.
     #[inline]
-    pub fn albedo(
-        &self,
-        detail: &Detail,
-        textures: &[Texture],
-        tiles: &dyn Textures,
-        uv: [f32; 2],
-    ) -> Option<[f32; 3]> {
+    pub fn albedo(&self, detail: &Detail, textures: &[Texture], tiles: &dyn Textures, at: At) -> Option<[f32; 3]> {
         let Bsdf::Diffuse { reflectance } = self.bsdf else { return None };
         let textured = detail.textured.iter().rev().find(|t| t.slot == Slot::Diffuse);
-        let color = |t: &Textured| textures[t.texture as usize].color(tiles, uv).to_array().map(share);
+        let color = |t: &Textured| scaled(textures[t.texture as usize].color(tiles, at), t.scale);
         Some(textured.map_or(reflectance, color))
     }
 }

@@ -411,7 +411,7 @@ impl Block {
                 self.light_d.set(i, light.d);
                 self.light_tmax[i] = light.tmax;
                 self.light_pdf[i] = light.pdf;
-                self.radiance.set(i, light.radiance);
+                self.radiance.set(i, context.radiance(&light));
             }
         }
     }

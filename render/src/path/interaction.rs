@@ -1,13 +1,14 @@
 //! What a hit looks like from the side it was hit from.
 
-use std::f32::consts::{FRAC_1_PI, PI};
+use std::f32::consts::PI;
 
 use glam::Vec3;
 
 use super::Surface;
 use crate::math::{Basis, Position, gamma, offset_origin};
 use crate::ray::Hit;
-use crate::world::Primitive;
+use crate::texture::At;
+use crate::world::{Primitive, interpolated as interpolated_at, sphere_uv};
 
 /// A point on a triangle, without branches.
 pub(super) struct Flat {
@@ -125,17 +126,12 @@ impl Interaction {
         offset_origin(&self.position, -self.normal)
     }
 
-    /// Texture coordinates: those of a triangle's vertices, interpolated, or the hit's own without; of a sphere its longitude and its colatitude from
-    /// z, in [0, 1].
-    pub(super) fn uv(&self, surface: &Surface, hit: &Hit) -> [f32; 2] {
+    /// Where textures are looked up. Texture coordinates are those of a triangle's vertices, interpolated, or the hit's own without; of a
+    /// sphere its longitude and its colatitude from z, in [0, 1].
+    pub(super) fn place(&self, surface: &Surface, hit: &Hit) -> At {
         match surface.geometry {
-            Primitive::Triangle(_) => triangle_uv(surface, hit),
-            Primitive::Sphere { flipped, .. } => {
-                let n = if flipped { -self.front } else { self.front };
-                let turn = libm::atan2f(n.y, n.x) * (0.5 * FRAC_1_PI);
-                let v = libm::atan2f((n.x * n.x + n.y * n.y).sqrt(), n.z) * FRAC_1_PI;
-                [if turn < 0.0 { turn + 1.0 } else { turn }, v]
-            }
+            Primitive::Triangle(_) => triangle_place(surface, hit),
+            Primitive::Sphere { flipped, .. } => At::uv(sphere_uv(if flipped { -self.front } else { self.front })),
         }
     }
 
@@ -224,11 +220,12 @@ impl Interaction {
     }
 }
 
-/// Texture coordinates of a hit of a triangle.
-pub(super) fn triangle_uv(surface: &Surface, hit: &Hit) -> [f32; 2] {
-    let Some([a, b, c]) = surface.uv else { return [hit.u, hit.v] };
-    let w = 1.0 - hit.u - hit.v;
-    std::array::from_fn(|k| a[k] * w + b[k] * hit.u + c[k] * hit.v)
+/// Where textures are looked up at a hit of a triangle.
+pub(super) fn triangle_place(surface: &Surface, hit: &Hit) -> At {
+    At {
+        uv: surface.uv.map_or([hit.u, hit.v], |uv| interpolated_at(&uv, hit.u, hit.v)),
+        attribute: surface.attribute.map_or(Vec3::ZERO, |a| interpolated_at(&a, hit.u, hit.v).into()),
+    }
 }
 
 /// The interpolated shading normal, turned to the side of the geometric normal; the geometric normal itself where there is none,
@@ -269,6 +266,7 @@ mod tests {
                 geometry: Primitive::Triangle(p.map(|v| v.to_array())),
                 normals: None,
                 uv: Some(uv),
+                attribute: None,
             };
             let [a, b, c] = p.map(Vec3::as_dvec3);
             let [ta, tb, tc] = uv.map(|t| t.map(f64::from));
@@ -304,10 +302,10 @@ mod tests {
     fn a_normal_map_is_in_the_frame_of_u() {
         let vertices = [[0.0, 0.0, 0.0], [2.0, 0.0, 0.0], [0.0, 3.0, 0.0]];
         let uv = Some([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]);
-        let surface = Surface { shape: 0, geometry: Primitive::Triangle(vertices), normals: None, uv };
+        let surface = Surface { shape: 0, geometry: Primitive::Triangle(vertices), normals: None, uv, attribute: None };
         let d = Vec3::new(0.1, 0.2, -1.0).normalize();
         let mut at = Interaction::new(Vec3::Z, d, &hit(0.2, 0.3), &surface).unwrap();
-        assert_eq!(at.uv(&surface, &hit(0.2, 0.3)), [0.2, 0.3]);
+        assert_eq!(at.place(&surface, &hit(0.2, 0.3)).uv, [0.2, 0.3]);
         at.turn_to(&surface, Vec3::new(0.6, 0.0, 1.6), false, d);
         assert!((at.shading - Vec3::new(0.6, 0.0, 1.6).normalize()).length() < 1e-6, "{}", at.shading);
         // seen from behind by the ray, or of no length: it stays
@@ -325,12 +323,17 @@ mod tests {
         for k in 0..2000 {
             let n = rng.direction();
             let (center, radius, flipped) = ([0.5, -1.0, 2.0], 0.7, k % 2 == 0);
-            let surface =
-                Surface { shape: 0, geometry: Primitive::Sphere { center, radius, flipped }, normals: None, uv: None };
+            let surface = Surface {
+                shape: 0,
+                geometry: Primitive::Sphere { center, radius, flipped },
+                normals: None,
+                uv: None,
+                attribute: None,
+            };
             let o = Vec3::from(center) + n * 3.0;
             let hit = Hit { t: 3.0 - radius, ..hit(0.0, 0.0) };
             let at = Interaction::new(o, -n, &hit, &surface).unwrap();
-            let [u, v] = at.uv(&surface, &hit).map(f64::from);
+            let [u, v] = at.place(&surface, &hit).uv.map(f64::from);
             let n = n.as_dvec3();
             let turn = n.y.atan2(n.x).rem_euclid(std::f64::consts::TAU) / std::f64::consts::TAU;
             let ring = n.x.hypot(n.y);

@@ -18,7 +18,7 @@ use bytemuck::{Pod, Zeroable};
 use glam::Vec3;
 
 use crate::frame::Frame;
-use crate::light::Lights;
+use crate::light::{LightSample, Lights};
 use crate::math::UnitDir;
 use crate::ray::{Hit, PathKey, PrimId, Ray};
 use crate::sampler::Stream;
@@ -106,6 +106,8 @@ pub struct Surface {
     pub normals: Option<[[f32; 3]; 3]>,
     /// Texture coordinates of a triangle's vertices.
     pub uv: Option<[[f32; 2]; 3]>,
+    /// The mesh's attribute at a triangle's vertices.
+    pub attribute: Option<[[f32; 3]; 3]>,
 }
 
 /// Where hits get their surfaces from: the splits in memory.
@@ -147,6 +149,15 @@ impl<'a> Context<'a> {
     /// Of a world without bitmaps, every skip made.
     pub fn new(world: &'a World, lights: &'a Lights, frame: &'a Frame) -> Self {
         Context { world, lights, frame, textures: &NoTextures, skips: Skips::ALL }
+    }
+
+    /// Radiance of a light sample.
+    #[inline(always)]
+    fn radiance(&self, light: &LightSample) -> Vec3 {
+        match light.look {
+            None => light.radiance,
+            Some((texture, at)) => light.radiance * self.world.textures[texture as usize].light(self.textures, at),
+        }
     }
 
     /// With tiles.

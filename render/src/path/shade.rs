@@ -4,14 +4,14 @@ use glam::Vec3;
 
 use super::block::{Block, FlatDiffuse};
 use super::diffuse::{Fate, cosine_direction, onwards, snap, towards_light};
-use super::interaction::{Interaction, triangle_uv};
+use super::interaction::{Interaction, triangle_place};
 use super::{Context, Contribution, Outcome, PathRay, ShadowRay, Surface, Surfaces, power_heuristic};
 use crate::material::{Blend, Bsdf, Detail, Material, Relief, ReliefKind};
 use crate::math::{UnitDir, unit};
 use crate::ray::{Hit, PathKey, Ray};
 use crate::sampler::{BSDF, LIGHT, LIGHT_CHOICE, LOBE, ROULETTE, Stream};
 use crate::skip::Skip;
-use crate::world::Primitive;
+use crate::world::{Primitive, ShapeInfo};
 
 /// Shades each ray with its hit and appends what comes of it to `out`.
 ///
@@ -170,8 +170,8 @@ fn painted<S: Surfaces>(
     }
     let surface = surfaces.surface(index, hit);
     let (Primitive::Triangle(vertices), None) = (surface.geometry, surface.normals) else { return None };
-    let uv = triangle_uv(&surface, hit);
-    let reflectance = material.albedo(detail, &context.world.textures, context.textures, uv)?;
+    let place = triangle_place(&surface, hit);
+    let reflectance = material.albedo(detail, &context.world.textures, context.textures, place)?;
     Some(FlatDiffuse { vertices, u: hit.u, v: hit.v, d, reflectance, two_sided: material.two_sided })
 }
 
@@ -187,13 +187,13 @@ fn arrive<'a, S: Surfaces>(
 ) -> Option<Leaving<'a>> {
     let (frame, world) = (context.frame, context.world);
     let shape = &world.shapes[surfaces.shape(index, hit) as usize];
-    if let Some(emission) = shape.emission {
+    if shape.emission.is_some() {
         if hidden(context, ray) {
             pass_through(surfaces, index, ray, hit, out);
             return None;
         }
         if is_first(context, ray) {
-            emit_surface(context, surfaces, index, ray, hit, emission.into(), out);
+            emit_surface(context, surfaces, index, ray, hit, shape, out);
         }
     }
     let number = u32::from(ray.key.vertex) + 1;
@@ -245,13 +245,19 @@ fn emit_surface<S: Surfaces>(
     index: usize,
     ray: &PathRay,
     hit: &Hit,
-    emission: Vec3,
+    shape: &ShapeInfo,
     out: &mut Outcome,
 ) {
     let (o, d) = (Vec3::from(ray.o), Vec3::from(ray.dir.decode()));
-    if let Some(at) = Interaction::new(o, d, hit, &surfaces.surface(index, hit))
+    let surface = surfaces.surface(index, hit);
+    if let Some(at) = Interaction::new(o, d, hit, &surface)
         && at.from_front
     {
+        let emission = Vec3::from(shape.emission.unwrap_or_default());
+        let emission = match shape.emission_texture {
+            None => emission,
+            Some(t) => emission * context.world.textures[t as usize].light(context.textures, at.place(&surface, hit)),
+        };
         let density = || context.lights.pdf(surfaces.prim(index, hit), o, hit.t, -at.normal.dot(d));
         let pdf = if ray.pdf > 0.0 { density() } else { 0.0 };
         emit(ray, emission, pdf, out);
@@ -332,8 +338,9 @@ pub(super) fn scatter_plain(
         let reflectance = Vec3::from(*reflectance);
         if let Some(light) = light {
             let (dir, wi) = snap(light.d);
+            let radiance = context.radiance(&light);
             let contribution =
-                towards_light(throughput, reflectance, at.normal, light.d, wi, light.pdf, light.radiance, true);
+                towards_light(throughput, reflectance, at.normal, light.d, wi, light.pdf, radiance, true);
             shadow(origin, dir, light.tmax, contribution, out);
         }
         note_unlit(out);
@@ -363,7 +370,7 @@ pub(super) fn scatter_plain(
                 let scattered = bsdf.eval(wo, local, at.from_front);
                 let weight = power_heuristic(light.pdf, scattered.pdf * opacity) / light.pdf;
                 let value = scattered.value * opacity;
-                throughput * value * light.radiance * weight
+                throughput * value * context.radiance(&light) * weight
             } else {
                 Vec3::ZERO
             };
@@ -439,15 +446,15 @@ fn appearance<'a>(
     number: &mut u32,
 ) -> (&'a Material, Option<Bsdf>, f32) {
     let (world, tiles) = (context.world, context.textures);
-    let uv = at.uv(surface, hit);
+    let place = at.place(surface, hit);
     let (mut material, mut opacity) = (material, 1.0);
     // each names materials above itself, so this ends
     let inner = loop {
         let Some(detail) = material.detail.as_deref() else { break None };
-        opacity *= detail.opacity.share(&world.textures, tiles, uv);
+        opacity *= detail.opacity.share(&world.textures, tiles, place);
         let next = match (detail.back, detail.blend) {
             (Some(back), _) if !at.from_front => back,
-            (_, Some(Blend { weight, parts })) => parts[choose(weight.share(&world.textures, tiles, uv), number)],
+            (_, Some(Blend { weight, parts })) => parts[choose(weight.share(&world.textures, tiles, place), number)],
             _ => break Some(detail),
         };
         material = &world.materials[next as usize];
@@ -457,16 +464,16 @@ fn appearance<'a>(
         let texture = &world.textures[texture as usize];
         match kind {
             ReliefKind::Bump(scale) => {
-                let gradient = texture.gradient(tiles, uv).map(|slope| slope * scale);
+                let gradient = texture.gradient(tiles, place.uv).map(|slope| slope * scale);
                 at.bump(surface, gradient, mirrored, d);
             }
             ReliefKind::Normals => {
-                at.turn_to(surface, texture.color(tiles, uv) * 2.0 - Vec3::ONE, mirrored, d);
+                at.turn_to(surface, texture.color(tiles, place) * 2.0 - Vec3::ONE, mirrored, d);
             }
         }
     }
     let textured = !detail.textured.is_empty();
-    (material, textured.then(|| material.at(detail, &world.textures, tiles, uv)), opacity)
+    (material, textured.then(|| material.at(detail, &world.textures, tiles, place)), opacity)
 }
 
 /// 1 with probability `weight`, which is in [0, 1], else 0; what is left of the number is as random.

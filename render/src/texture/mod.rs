@@ -38,32 +38,64 @@ impl UvMap {
     }
 }
 
-/// A texture. It is no function of anything but (u, v).
+/// Where on a surface a texture is looked up.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct At {
+    /// Texture coordinates.
+    pub uv: [f32; 2],
+    /// The mesh's attribute, interpolated; 0 where it has none.
+    pub attribute: Vec3,
+}
+
+impl At {
+    /// Where there is no attribute.
+    #[inline(always)]
+    pub fn uv(uv: [f32; 2]) -> At {
+        At { uv, attribute: Vec3::ZERO }
+    }
+}
+
+/// A texture. It is no function of anything but the texture coordinates and the mesh's attribute.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub enum Texture {
     /// An image.
     Bitmap(Bitmap),
     /// Squares of two colours.
     Checkerboard(Checkerboard),
+    /// The mesh's attribute.
+    Attribute {
+        /// What it is multiplied by.
+        scale: f32,
+    },
 }
 
 impl Texture {
     /// The colour at texture coordinates, linear Rec. 709; a grey image's value in all channels. 0 where a tile cannot be had.
     #[inline]
-    pub fn color(&self, tiles: &dyn Textures, uv: [f32; 2]) -> Vec3 {
+    pub fn color(&self, tiles: &dyn Textures, at: At) -> Vec3 {
         match self {
-            Texture::Bitmap(bitmap) => bitmap.color(tiles, uv),
-            Texture::Checkerboard(checkerboard) => checkerboard.color(uv),
+            Texture::Bitmap(bitmap) => bitmap.color(tiles, at.uv),
+            Texture::Checkerboard(checkerboard) => checkerboard.color(at.uv),
+            Texture::Attribute { scale } => at.attribute * *scale,
         }
+    }
+
+    /// The colour as light: what is below 0 or no number is 0.
+    #[inline]
+    pub fn light(&self, tiles: &dyn Textures, at: At) -> Vec3 {
+        let light = |x: f32| if x > 0.0 && x < f32::INFINITY { x } else { 0.0 };
+        let [r, g, b] = self.color(tiles, at).to_array().map(light);
+        Vec3::new(r, g, b)
     }
 
     /// One number at texture coordinates: a grey image's value, the luminance of a colour. Of a checkerboard the number of the *other* square, as
     /// Mitsuba has it.
     #[inline]
-    pub fn amount(&self, tiles: &dyn Textures, uv: [f32; 2]) -> f32 {
+    pub fn amount(&self, tiles: &dyn Textures, at: At) -> f32 {
         match self {
-            Texture::Bitmap(bitmap) => bitmap.amount(bitmap.color(tiles, uv)),
-            Texture::Checkerboard(checkerboard) => luminance(checkerboard.other(uv)),
+            Texture::Bitmap(bitmap) => bitmap.amount(bitmap.color(tiles, at.uv)),
+            Texture::Checkerboard(checkerboard) => luminance(checkerboard.other(at.uv)),
+            Texture::Attribute { scale } => luminance(at.attribute * *scale),
         }
     }
 
@@ -72,7 +104,7 @@ impl Texture {
     pub fn gradient(&self, tiles: &dyn Textures, uv: [f32; 2]) -> [f32; 2] {
         match self {
             Texture::Bitmap(bitmap) => bitmap.gradient(tiles, uv),
-            Texture::Checkerboard(_) => [0.0; 2],
+            Texture::Checkerboard(_) | Texture::Attribute { .. } => [0.0; 2],
         }
     }
 
@@ -80,7 +112,7 @@ impl Texture {
     pub fn tiles(&self) -> std::ops::Range<u32> {
         match self {
             Texture::Bitmap(bitmap) => bitmap.tiles(),
-            Texture::Checkerboard(_) => 0..0,
+            Texture::Checkerboard(_) | Texture::Attribute { .. } => 0..0,
         }
     }
 }

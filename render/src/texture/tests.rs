@@ -222,17 +222,17 @@ fn values_are_mitsubas() {
     ];
     for (texel, uv, color, amount, gradient) in rows {
         let texture = bitmap(texel);
-        let found = texture.color(&tiles, uv).to_array();
+        let found = texture.color(&tiles, At::uv(uv)).to_array();
         assert!((0..3).all(|c| (found[c] - color[c] as f32).abs() < 2e-6), "{found:?} {color:?}");
         // its luminance is 0.212671 R + 0.715160 G + 0.072169 B
-        assert!((texture.amount(&tiles, uv) - amount as f32).abs() < 1e-4);
+        assert!((texture.amount(&tiles, At::uv(uv)) - amount as f32).abs() < 1e-4);
         let found = texture.gradient(&tiles, uv);
         assert!((0..2).all(|k| (found[k] - gradient[k] as f32).abs() < 2e-4), "{found:?} {gradient:?}");
     }
     let checkerboard = Texture::Checkerboard(Checkerboard { to_uv: UvMap::IDENTITY, colors: [[0.3; 3], [0.6; 3]] });
     for (uv, color, amount) in [([0.25, 0.25], 0.3, 0.6), ([0.75, 0.25], 0.6, 0.3), ([0.5, 0.25], 0.3, 0.6)] {
-        assert_eq!(checkerboard.color(&NoTextures, uv).x, color);
-        assert!((checkerboard.amount(&NoTextures, uv) - amount).abs() < 1e-6);
+        assert_eq!(checkerboard.color(&NoTextures, At::uv(uv)).x, color);
+        assert!((checkerboard.amount(&NoTextures, At::uv(uv)) - amount).abs() < 1e-6);
     }
 }
 

@@ -1,13 +1,18 @@
-//! Meshes and volumes without a scene around them: one grey two-sided material, camera and light by [`super::framing`].
+//! Meshes and volumes without a scene around them: their own materials and colours, or one grey two-sided material; camera and light by
+//! [`super::framing`].
 
 use std::path::{Path, PathBuf};
 
 use super::framing::{self, Up};
 use super::isosurface::IsoSurfaceSource;
 use super::mesh::extension;
+use super::mtl::Libraries;
 use super::{DEFAULT_ALBEDO, ImportOptions, refuse};
 use crate::ImportError;
-use crate::description::{Affine, Bsdf, Description, Environment, Geometry, Material, MeshFormat, Place, Shape};
+use crate::description::{
+    Affine, Bsdf, Description, Detail, Environment, Geometry, Material, MeshFormat, Place, Shape, Slot, Texture,
+    TextureKind, Textured,
+};
 
 /// The mesh format that a file's name says.
 pub(super) fn mesh_format(path: &Path) -> Option<MeshFormat> {
@@ -35,19 +40,60 @@ pub(super) fn meshes_in(folder: &Path) -> Result<Vec<(PathBuf, MeshFormat)>, Imp
     Ok(found)
 }
 
-/// Meshes in this order.
+/// Meshes in this order, with their materials and colours if `looks`.
 pub(super) fn meshes(
     path: &Path,
     files: &[(PathBuf, MeshFormat)],
     options: &ImportOptions,
+    looks: bool,
 ) -> Result<(Description, Up), ImportError> {
     if options.iso.is_some() {
         return refuse(path, "an iso value was given, but a mesh is a surface already: leave it out");
     }
     let mut out = description(options);
+    let mut unsupported = vec![];
     for (path, format) in files {
-        let geometry = Geometry::MeshFile { path: path.clone(), format: *format, flip_v: false, smooth: false };
-        out.shapes.push(shape(path, geometry));
+        let format = *format;
+        let (mut attribute, mut parts, mut made) = (None, None, vec![]);
+        // an albedo that was asked for is that of all
+        let looks = looks && options.albedo.is_none();
+        match format {
+            MeshFormat::Obj if looks => {
+                let (names, bytes) = super::obj::libraries(path)?;
+                out.bytes_read += bytes;
+                let mut libraries = Libraries { options, out: &mut out, unsupported: vec![] };
+                if let Some((found, materials)) = libraries.read(path, &names)? {
+                    (parts, made) = (Some(found), materials);
+                }
+                unsupported.append(&mut libraries.unsupported);
+            }
+            MeshFormat::Ply if looks => {
+                let (found, bytes) = super::ply::colors(path)?;
+                out.bytes_read += bytes;
+                attribute = found;
+            }
+            _ => {}
+        }
+        let colored = attribute.is_some();
+        // texture coordinates of OBJ have v upwards
+        let flip_v = format == MeshFormat::Obj;
+        let geometry = Geometry::MeshFile { path: path.clone(), format, flip_v, smooth: false, attribute, parts };
+        let material = if colored { color_material(&mut out) } else { 0 };
+        out.shapes.push(Shape { material, ..shape(path, geometry) });
+        for part in made {
+            out.materials.push(part.material);
+            out.shapes.push(Shape {
+                name: part.name,
+                place: part.place,
+                material: out.materials.len() as u32 - 1,
+                emission: part.emission,
+                emission_texture: part.emission_texture,
+                ..shape(path, Geometry::Part)
+            });
+        }
+    }
+    if !unsupported.is_empty() {
+        return Err(ImportError::Unsupported(unsupported));
     }
     let up = if files.iter().all(|(_, format)| *format == MeshFormat::Stl) { Up::Z } else { Up::Y };
     Ok((out, up))
@@ -80,6 +126,22 @@ fn description(options: &ImportOptions) -> Description {
     }
 }
 
+/// Number of the material whose albedo is the mesh's colour.
+fn color_material(out: &mut Description) -> u32 {
+    const NAME: &str = "colours";
+    if let Some(n) = out.materials.iter().position(|m| m.name == NAME) {
+        return n as u32;
+    }
+    let kind = TextureKind::Attribute { name: "color".into(), scale: 1.0 };
+    out.textures.push(Texture { place: Place::default(), kind });
+    let textured = vec![Textured::new(Slot::Diffuse, out.textures.len() as u32 - 1)];
+    let bsdf = Bsdf::Diffuse { reflectance: DEFAULT_ALBEDO };
+    let mut material = Material::new(NAME, bsdf, true);
+    material.detail = Some(Box::new(Detail { textured, ..Detail::default() }));
+    out.materials.push(material);
+    out.materials.len() as u32 - 1
+}
+
 fn shape(path: &Path, geometry: Geometry) -> Shape {
     Shape {
         name: path.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default(),
@@ -88,6 +150,7 @@ fn shape(path: &Path, geometry: Geometry) -> Shape {
         to_world: Affine::IDENTITY,
         material: 0,
         emission: None,
+        emission_texture: None,
         flip_normals: false,
         face_normals: false,
     }

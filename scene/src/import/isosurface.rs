@@ -149,7 +149,7 @@ impl RecordStream for IsoSurfaceStream<'_> {
             let slab = Slab { z: self.z, low: &self.low, high: &self.high };
             let (kept, shape) = (&mut self.kept, self.shape);
             let more = self.grid.next_cell(&slab, &mut self.cursor, |p| {
-                let record = Record::Triangle(TriangleRecord { p, n: None, uv: None, shape });
+                let record = Record::Triangle(TriangleRecord { p, n: None, uv: None, attribute: None, shape });
                 if out.len() < end { out.push(record) } else { kept.push(record) }
             });
             if !more {

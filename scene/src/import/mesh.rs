@@ -25,6 +25,10 @@ pub(super) trait TriangleReader {
     fn has_normals(&self, triangle: &Self::Triangle) -> bool;
     /// Numbers of its vertices, below [`TriangleReader::vertex_count`].
     fn vertices(triangle: &Self::Triangle) -> [usize; 3];
+    /// The part of the mesh that it belongs to: how many shapes after the mesh's own.
+    fn part(_: &Self::Triangle) -> u32 {
+        0
+    }
     /// Vertices read so far.
     fn vertex_count(&self) -> usize;
     fn source(&self) -> &Source;
@@ -37,6 +41,7 @@ pub(super) struct Corners {
     pub p: [[f64; 3]; 3],
     pub n: Option<[[f32; 3]; 3]>,
     pub uv: Option<[[f32; 2]; 3]>,
+    pub attribute: Option<[[f32; 3]; 3]>,
 }
 
 /// A reader as a stream of records.
@@ -82,13 +87,13 @@ impl<R: TriangleReader> RecordStream for MeshStream<'_, R> {
                 None => self.reader.next()?,
             };
             let Some(triangle) = triangle else { break };
-            let corners = self.reader.corners(&triangle);
-            let mut uv = corners.uv;
+            let mut corners = self.reader.corners(&triangle);
             if self.flip_v {
-                uv.iter_mut().flatten().for_each(|uv| uv[1] = 1.0 - uv[1]);
+                corners.uv.iter_mut().flatten().for_each(|uv| uv[1] = 1.0 - uv[1]);
             }
             let smooth = || self.kept.as_ref()?.normals(R::vertices(&triangle));
-            out.push(self.placement.triangle(corners.p, corners.n.or_else(smooth), uv));
+            corners.n = corners.n.or_else(smooth);
+            out.push(self.placement.triangle(corners, R::part(&triangle)));
             n += 1;
         }
         let spilled = self.reader.budget().spilled();

@@ -7,6 +7,7 @@ pub mod isosurface;
 mod mesh;
 mod metals;
 mod mitsuba;
+mod mtl;
 mod number;
 mod obj;
 mod options;
@@ -59,7 +60,7 @@ enum Kind {
 /// # Errors
 /// The file cannot be read, is malformed, has elements that are not supported (all are listed), or gives no light.
 pub fn import(path: &Path, options: &ImportOptions) -> Result<Description, ImportError> {
-    let (mut out, up, bare) = read(path, options)?;
+    let (mut out, up, bare) = read(path, options, true)?;
     place_camera(path, &mut out, up, bare, options)?;
     if let Some(sky) = options.sky {
         out.environment = Some(Environment::Constant(sky));
@@ -79,16 +80,17 @@ pub fn import(path: &Path, options: &ImportOptions) -> Result<Description, Impor
     Ok(out)
 }
 
-/// Reads the shapes of a scene as they are: no camera or light is added, and none is asked for.
+/// Reads the shapes of a scene as they are: no camera or light is added, and none is asked for; nor are a mesh's materials and colours.
 ///
 /// # Errors
 /// As [`import`], but for light.
 pub fn import_surface(path: &Path, options: &ImportOptions) -> Result<Description, ImportError> {
-    Ok(read(path, options)?.0)
+    Ok(read(path, options, false)?.0)
 }
 
-/// What the source says, which way is up, and whether it is a surface without a scene.
-fn read(path: &Path, options: &ImportOptions) -> Result<(Description, Up, bool), ImportError> {
+/// What the source says, which way is up, and whether it is a surface without a scene. `looks`: with what a mesh says of its materials and
+/// colours.
+fn read(path: &Path, options: &ImportOptions, looks: bool) -> Result<(Description, Up, bool), ImportError> {
     let (kind, head) = kind(path)?;
     let bare = !matches!(kind, Kind::Mitsuba);
     if bare && !options.defines.is_empty() {
@@ -106,7 +108,7 @@ fn read(path: &Path, options: &ImportOptions) -> Result<(Description, Up, bool),
             }
             (mitsuba::import(path, options)?, Up::Y)
         }
-        Kind::Mesh(format) => bare::meshes(path, &[(path.to_path_buf(), format)], options)?,
+        Kind::Mesh(format) => bare::meshes(path, &[(path.to_path_buf(), format)], options, looks)?,
         Kind::Volume => bare::volume(path, options)?,
         Kind::Folder => match bare::meshes_in(path)? {
             meshes if meshes.is_empty() && options.iso.is_none() => {
@@ -116,7 +118,7 @@ fn read(path: &Path, options: &ImportOptions) -> Result<(Description, Up, bool),
                 );
             }
             meshes if meshes.is_empty() => bare::volume(path, options)?,
-            meshes => bare::meshes(path, &meshes, options)?,
+            meshes => bare::meshes(path, &meshes, options, looks)?,
         },
     };
     if out.shapes.is_empty() {
@@ -138,7 +140,9 @@ fn place_camera(
         out.camera = Some(view.camera().or_else(|e| refuse(path, e.to_string()))?);
     }
     let mut lights = options.lights.clone();
-    if out.camera.is_none() || (bare && lights.is_empty()) {
+    // a mesh whose materials shine has its own
+    let wants_lights = bare && lights.is_empty() && out.shapes.iter().all(|s| s.emission.is_none());
+    if out.camera.is_none() || wants_lights {
         let bounds = match out.bounds {
             Some(bounds) => bounds,
             None => bounds::measure(out)?,
@@ -151,7 +155,7 @@ fn place_camera(
             tracing::info!("the source has no camera; one is placed to frame it");
             out.camera = Some(frame.camera);
         }
-        if bare && lights.is_empty() {
+        if wants_lights {
             lights.extend(frame.lights);
         }
         out.bounds = Some(bounds);

@@ -1,7 +1,10 @@
 //! Wavefront OBJ: `v`, `vt`, `vn` and `f`, with negative (relative) indices and continued lines; polygons are fanned from
-//! their first corner. Groups, materials, lines, points and free-form surfaces are passed over.
+//! their first corner. Materials (`usemtl`) cut a file into parts; groups, lines, points and free-form surfaces are passed over.
 
+use std::collections::HashMap;
 use std::path::Path;
+
+use bytemuck::{Pod, Zeroable};
 
 use super::mesh::{Corners, Positions, TriangleReader, budget};
 use super::number::{Number, number};
@@ -9,6 +12,7 @@ use super::source::{Source, show};
 use super::spill::{Budget, Column};
 use super::stream::StreamOptions;
 use crate::ImportError;
+use crate::description::Parts;
 
 /// Longest line with its continuations.
 const MAX_LINE: usize = 1 << 20;
@@ -30,13 +34,56 @@ pub(super) struct ObjReader {
     line: Vec<u8>,
     /// Whether anything was read that an OBJ file has.
     recognized: bool,
-    /// Whether a library of materials is to be told of, once.
-    tell_materials: bool,
+    parts: Option<PartNumbers>,
+    /// Of what is read now.
+    part: u32,
+}
+
+/// Which part a name means.
+struct PartNumbers {
+    by_name: HashMap<Vec<u8>, u32>,
+    parts: Parts,
+}
+
+/// A triangle as numbers of what its corners have, and its part.
+#[repr(C)]
+#[derive(Clone, Copy, Pod, Zeroable)]
+pub(super) struct Face {
+    corners: [Corner; 3],
+    part: u32,
+}
+
+/// A `mtllib` statement: what it says, and the line.
+pub(super) type LibraryNames = Vec<(String, u32)>;
+
+/// The `mtllib` statements before a file's first face or `usemtl`; and the bytes read to find them.
+pub(super) fn libraries(path: &Path) -> Result<(LibraryNames, u64), ImportError> {
+    let mut reader = ObjReader::open(path, &StreamOptions::default(), None)?;
+    let mut out = vec![];
+    while reader.read_line()? {
+        let line = reader.line.trim_ascii_start();
+        let (keyword, rest) = line.split_at(line.iter().position(u8::is_ascii_whitespace).unwrap_or(line.len()));
+        match keyword {
+            b"mtllib" => out.push((name_of(rest), reader.source.place().1)),
+            b"f" | b"usemtl" => break,
+            _ => {}
+        }
+    }
+    Ok((out, reader.source.bytes_read()))
+}
+
+/// A name as messages and maps have it.
+fn name_of(text: &[u8]) -> String {
+    String::from_utf8_lossy(text.trim_ascii()).into_owned()
 }
 
 impl ObjReader {
-    /// Opens a file.
-    pub fn open(path: &Path, options: &StreamOptions) -> Result<Self, ImportError> {
+    /// Opens a file whose materials are these parts.
+    pub fn open(path: &Path, options: &StreamOptions, parts: Option<&Parts>) -> Result<Self, ImportError> {
+        let numbers = |parts: &Parts| PartNumbers {
+            by_name: (1u32..).zip(&parts.names).map(|(n, name)| (name.clone().into_bytes(), n)).collect(),
+            parts: parts.clone(),
+        };
         Ok(ObjReader {
             source: Source::open(path)?,
             budget: budget(options),
@@ -47,23 +94,35 @@ impl ObjReader {
             fanned: 0,
             line: vec![],
             recognized: false,
-            tell_materials: false,
+            parts: parts.map(numbers),
+            part: 0,
         })
     }
 
-    /// The same, which warns when the file names materials: nobody else gives the mesh its own.
-    pub fn telling_materials(self) -> Self {
-        ObjReader { tell_materials: true, ..self }
+    /// The part of what follows.
+    fn use_material(&mut self, rest: &[u8]) -> Result<(), ImportError> {
+        let Some(parts) = &self.parts else { return Ok(()) };
+        let name = name_of(rest);
+        self.part = match parts.by_name.get(name.as_bytes()) {
+            Some(&part) => part,
+            None if parts.parts.lenient => 0,
+            None => {
+                return self.source.fail_line(format!(
+                    "usemtl \"{name}\", which no mtllib of this file defines: add it there, or pass --albedo to use no materials"
+                ));
+            }
+        };
+        Ok(())
     }
 
-    fn tell_materials(&mut self) {
-        if std::mem::take(&mut self.tell_materials) {
-            let (file, line) = self.source.place();
-            tracing::warn!(
-                "{}:{line}: the file's materials (mtllib) are not read, the mesh is of one: choose it by --albedo, or write a \
-                 Mitsuba scene around the mesh",
-                file.display()
-            );
+    /// Libraries are read before the file is.
+    fn library(&self, rest: &[u8]) -> Result<(), ImportError> {
+        let name = name_of(rest);
+        match &self.parts {
+            Some(parts) if !parts.parts.lenient && !parts.parts.libraries.contains(&name) => self.source.fail_line(
+                format!("mtllib \"{name}\" stands after the first face or usemtl: move it to the top of the file"),
+            ),
+            _ => Ok(()),
         }
     }
 
@@ -96,7 +155,8 @@ impl ObjReader {
                 b"vt" => self.texture_coordinate(words)?,
                 b"vn" => self.normal(words)?,
                 b"f" => self.face(words)?,
-                b"mtllib" => self.tell_materials(),
+                b"usemtl" => self.use_material(after(&line, keyword))?,
+                b"mtllib" => self.library(after(&line, keyword))?,
                 _ => {}
             }
             self.line = line;
@@ -201,36 +261,46 @@ impl ObjReader {
     }
 }
 
-impl TriangleReader for ObjReader {
-    type Triangle = [Corner; 3];
+/// What of a line stands after its first word.
+fn after<'l>(line: &'l [u8], keyword: &[u8]) -> &'l [u8] {
+    &line.trim_ascii_start()[keyword.len()..]
+}
 
-    fn next(&mut self) -> Result<Option<[Corner; 3]>, ImportError> {
+impl TriangleReader for ObjReader {
+    type Triangle = Face;
+
+    fn next(&mut self) -> Result<Option<Face>, ImportError> {
         if self.fanned + 2 >= self.polygon.len() && !self.next_polygon()? {
             return Ok(None);
         }
         self.fanned += 1;
-        Ok(Some([0, self.fanned, self.fanned + 1].map(|i| self.polygon[i])))
+        Ok(Some(Face { corners: [0, self.fanned, self.fanned + 1].map(|i| self.polygon[i]), part: self.part }))
     }
 
-    fn corners(&self, triangle: &[Corner; 3]) -> Corners {
+    fn corners(&self, triangle: &Face) -> Corners {
         // every index was compared with the numbers of its kind
         let all = |k: usize| {
-            let has = triangle.iter().all(|c| c[k] != NONE);
-            has.then(|| triangle.map(|c| c[k] as usize))
+            let has = triangle.corners.iter().all(|c| c[k] != NONE);
+            has.then(|| triangle.corners.map(|c| c[k] as usize))
         };
         Corners {
             p: Self::vertices(triangle).map(|i| self.positions.get(i).unwrap_or([f64::NAN; 3])),
             n: all(2).map(|n| n.map(|i| self.normals.get(i).unwrap_or_default())),
             uv: all(1).map(|uv| uv.map(|i| self.uv.get(i).unwrap_or_default())),
+            attribute: None,
         }
     }
 
-    fn has_normals(&self, triangle: &[Corner; 3]) -> bool {
-        triangle.iter().all(|c| c[2] != NONE)
+    fn has_normals(&self, triangle: &Face) -> bool {
+        triangle.corners.iter().all(|c| c[2] != NONE)
     }
 
-    fn vertices(triangle: &[Corner; 3]) -> [usize; 3] {
-        triangle.map(|c| c[0] as usize)
+    fn vertices(triangle: &Face) -> [usize; 3] {
+        triangle.corners.map(|c| c[0] as usize)
+    }
+
+    fn part(triangle: &Face) -> u32 {
+        triangle.part
     }
 
     fn vertex_count(&self) -> usize {

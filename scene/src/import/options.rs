@@ -120,6 +120,7 @@ impl Light {
             to_world: frame.after(&scale),
             material,
             emission: Some(self.radiance).filter(|rgb| rgb.iter().any(|v| *v > 0.0)),
+            emission_texture: None,
             flip_normals: false,
             face_normals: true,
         })

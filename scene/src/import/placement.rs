@@ -1,5 +1,6 @@
 //! From a shape's own space to world-space records.
 
+use super::mesh::Corners;
 use super::vector::{cofactors, normalize};
 use crate::description::{Affine, Shape};
 use crate::record::{Record, TriangleRecord};
@@ -38,23 +39,24 @@ impl Placement {
         self.keep_normals
     }
 
-    /// The record of a triangle that is counter-clockwise from the front in the shape's own space.
+    /// The record of a triangle that is counter-clockwise from the front in the shape's own space, and of the shape of this part (0: its own).
     ///
     /// A shading normal without direction drops the triangle's shading normals.
-    pub fn triangle(&self, p: [[f64; 3]; 3], n: Option<[[f32; 3]; 3]>, uv: Option<[[f32; 2]; 3]>) -> Record {
+    pub(super) fn triangle(&self, corners: Corners, part: u32) -> Record {
+        let Corners { p, n, mut uv, mut attribute } = corners;
         let mut p = if self.identity { p } else { p.map(|v| self.to_world.point(v)) };
         let mut n = n.filter(|_| self.keep_normals).and_then(|n| {
             let [a, b, c] = n.map(|v| self.normal(v));
             Some([a?, b?, c?])
         });
-        let mut uv = uv;
         if self.reverse {
             // the first vertex stays, as does the place in the stream
             p.swap(1, 2);
             n.iter_mut().for_each(|n| n.swap(1, 2));
             uv.iter_mut().for_each(|uv| uv.swap(1, 2));
+            attribute.iter_mut().for_each(|a| a.swap(1, 2));
         }
-        Record::Triangle(TriangleRecord { p, n, uv, shape: self.shape })
+        Record::Triangle(TriangleRecord { p, n, uv, attribute, shape: self.shape + part })
     }
 
     fn normal(&self, n: [f32; 3]) -> Option<[f32; 3]> {

@@ -205,6 +205,7 @@ impl TriangleReader for SerializedReader {
             p: vertices.map(|i| self.positions.get(i).unwrap_or([f64::NAN; 3])),
             n: self.normals.as_ref().map(|n| vertices.map(|i| n.get(i).unwrap_or_default())),
             uv: self.uv.as_ref().map(|uv| vertices.map(|i| uv.get(i).unwrap_or_default())),
+            attribute: None,
         }
     }
 

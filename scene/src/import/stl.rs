@@ -171,7 +171,7 @@ impl TriangleReader for StlReader {
     }
 
     fn corners(&self, p: &[[f64; 3]; 3]) -> Corners {
-        Corners { p: *p, n: None, uv: None }
+        Corners { p: *p, n: None, uv: None, attribute: None }
     }
 
     fn has_normals(&self, _: &[[f64; 3]; 3]) -> bool {

@@ -7,7 +7,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use rayherd_render::skip::{Skip, Skips};
 
 use super::isosurface::IsoSurfaceSource;
-use super::mesh::{MeshOptions, MeshStream};
+use super::mesh::{Corners, MeshOptions, MeshStream};
 use super::obj::ObjReader;
 use super::placement::Placement;
 use super::ply::PlyReader;
@@ -105,16 +105,16 @@ impl<'a> DescriptionSource<'a> {
                 Box::new(InlineStream { placement, positions, normals, uv, triangles: triangles.iter() })
             }
             Geometry::Sphere { center, radius } => Box::new(Once(Some(sphere(shape, number, *center, *radius)))),
-            Geometry::MeshFile { path, format, flip_v, smooth } => {
-                let (smooths, smooth) = (*smooth, *smooth && normals);
+            Geometry::Part => Box::new(Once(None)),
+            Geometry::MeshFile { path, format, flip_v, smooth, attribute, parts } => {
+                let smooth = *smooth && normals;
                 let options = MeshOptions { placement, flip_v: *flip_v, smooth, spilled: &self.spilled };
                 match format {
-                    MeshFormat::Ply => Box::new(MeshStream::new(PlyReader::open(path, &self.options)?, options)?),
+                    MeshFormat::Ply => {
+                        Box::new(MeshStream::new(PlyReader::open(path, &self.options, attribute.as_ref())?, options)?)
+                    }
                     MeshFormat::Obj => {
-                        let reader = ObjReader::open(path, &self.options)?;
-                        // a scene around the mesh gives it a material (and smooths it); told in one of two passes
-                        let reader = if normals && !smooths { reader.telling_materials() } else { reader };
-                        Box::new(MeshStream::new(reader, options)?)
+                        Box::new(MeshStream::new(ObjReader::open(path, &self.options, parts.as_ref())?, options)?)
                     }
                     MeshFormat::Serialized(index) => {
                         let reader = SerializedReader::open(path, *index, &self.options)?;
@@ -223,7 +223,7 @@ impl RecordStream for InlineStream<'_> {
             let p = triangle.map(|i| self.positions[i as usize]);
             let n = (!self.normals.is_empty()).then(|| triangle.map(|i| self.normals[i as usize]));
             let uv = (!self.uv.is_empty()).then(|| triangle.map(|i| self.uv[i as usize]));
-            out.push(self.placement.triangle(p, n, uv));
+            out.push(self.placement.triangle(Corners { p, n, uv, attribute: None }, 0));
         }
         Ok(out.len() - before)
     }

@@ -4,7 +4,7 @@ use super::stream::{DescriptionSource, StreamOptions};
 use crate::ImportError;
 use crate::description::{Description, TextureKind};
 use crate::image;
-use crate::record::Record;
+use crate::record::{Record, SphereRecord, TriangleRecord};
 
 /// Of a geometry object a triangle takes about this (eight-wide nodes, vertices, ids; measured 51.8 on 8 million triangles).
 const BYTES_PER_TRIANGLE: u64 = 52;
@@ -37,6 +37,8 @@ pub struct ShapeSurvey {
     pub with_normals: u64,
     /// Triangles with texture coordinates.
     pub with_uv: u64,
+    /// Triangles with the mesh's attribute.
+    pub with_attribute: u64,
     /// Why it could not be read to its end.
     pub error: Option<ImportError>,
 }
@@ -55,13 +57,12 @@ impl Survey {
             out.bytes_read += std::fs::metadata(path).map_or(0, |m| m.len());
             out.textures.push(read.map(|image| image.header.bytes()));
         }
+        out.shapes.resize_with(description.shapes.len(), ShapeSurvey::default);
         for number in 0..description.shapes.len() {
-            let mut shape = ShapeSurvey::default();
-            match read(&source, number, &mut shape, &mut out.bounds) {
+            match read(&source, number, &mut out.shapes, &mut out.bounds) {
                 Ok(bytes) => out.bytes_read += bytes,
-                Err(error) => shape.error = Some(error),
+                Err(error) => out.shapes[number].error = Some(error),
             }
-            out.shapes.push(shape);
         }
         out
     }
@@ -74,8 +75,10 @@ impl Survey {
     /// About what the prepared scene takes, bytes, without copies by overlap reduction: trees and vertices; shape numbers, normals and
     /// texture coordinates; texels.
     pub fn prepared_bytes(&self) -> u64 {
-        let shapes = self
-            .sum(|s| s.triangles * (BYTES_PER_TRIANGLE + 4) + s.with_normals * 36 + s.with_uv * 24 + s.spheres * 32);
+        let shapes = self.sum(|s| {
+            let attributes = (s.with_normals + s.with_attribute) * 36 + s.with_uv * 24;
+            s.triangles * (BYTES_PER_TRIANGLE + 4) + attributes + s.spheres * 32
+        });
         shapes + self.texture_bytes()
     }
 
@@ -88,7 +91,7 @@ impl Survey {
 fn read(
     source: &DescriptionSource,
     number: usize,
-    shape: &mut ShapeSurvey,
+    shapes: &mut [ShapeSurvey],
     bounds: &mut [[f64; 3]; 2],
 ) -> Result<u64, ImportError> {
     let mut stream = source.open_one(number)?;
@@ -100,6 +103,9 @@ fn read(
         }
         for record in &records {
             let finite = super::bounds::add(bounds, record);
+            // a file's parts are shapes of their own
+            let (Record::Triangle(TriangleRecord { shape, .. }) | Record::Sphere(SphereRecord { shape, .. })) = record;
+            let shape = &mut shapes[*shape as usize];
             shape.not_finite += u64::from(!finite);
             match record {
                 Record::Triangle(t) => {
@@ -107,6 +113,7 @@ fn read(
                     shape.flat += u64::from(finite && super::vector::cross(edge(t.p, 1), edge(t.p, 2)) == [0.0; 3]);
                     shape.with_normals += u64::from(t.n.is_some());
                     shape.with_uv += u64::from(t.uv.is_some());
+                    shape.with_attribute += u64::from(t.attribute.is_some());
                 }
                 Record::Sphere(_) => shape.spheres += 1,
             }

@@ -23,10 +23,11 @@ pub(super) fn mesh_shape(path: &Path, format: MeshFormat, smooth: bool) -> Descr
     let shape = Shape {
         name: "mesh".into(),
         place: Place::default(),
-        geometry: Geometry::MeshFile { path: path.into(), format, flip_v: false, smooth },
+        geometry: Geometry::MeshFile { path: path.into(), format, flip_v: false, smooth, attribute: None, parts: None },
         to_world: Affine::IDENTITY,
         material: 0,
         emission: None,
+        emission_texture: None,
         flip_normals: false,
         face_normals: false,
     };
@@ -123,8 +124,8 @@ fn gzip_is_unpacked() {
     let packed = packer.finish().unwrap();
     let path = write(&dir, "a.ply.gz", &packed);
     let out = import(&path, &ImportOptions::default()).unwrap();
-    // the pass for the bounds, and before it the head that tells the format
-    assert_eq!((out.bytes_read, out.passes), (packed.len() as u64 + packed.len().min(256) as u64, 1));
+    // the pass for the bounds, and before it the head that tells the format and the header that tells of colours
+    assert_eq!((out.bytes_read, out.passes), (2 * packed.len() as u64 + packed.len().min(256) as u64, 1));
     assert_eq!(records(&out).unwrap().len(), 5);
     let path = write(&dir, "b.ply.gz", &packed[..packed.len() - 12]);
     assert!(matches!(import(&path, &ImportOptions::default()), Err(ImportError::Malformed { .. })));

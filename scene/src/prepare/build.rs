@@ -9,7 +9,7 @@ use super::PrepareError;
 use super::clock::Clock;
 use super::counting::CountingStore;
 use super::incidence::CellBox;
-use super::records::{NORMALS, Records, UVS};
+use super::records::{ATTRIBUTES, NORMALS, Records, UVS};
 use crate::grid::count::box_of;
 use crate::grid::lattice::{round_down, round_up};
 use crate::manifest::SplitEntry;
@@ -77,12 +77,15 @@ pub(crate) fn build_split(
 fn attributes(records: &Records) -> AttributeBlock {
     let shapes: Vec<u32> =
         records.extras.iter().map(|e| e.shape).chain(records.spheres.iter().map(|s| s.shape)).collect();
-    let mut block = AttributeBlock { shapes, normals: Vec::new(), uvs: Vec::new() };
+    let mut block = AttributeBlock { shapes, ..AttributeBlock::default() };
     if !records.normals.is_empty() {
         block.normals = spread(records, &records.normals, NORMALS);
     }
     if !records.uvs.is_empty() {
         block.uvs = spread(records, &records.uvs, UVS);
+    }
+    if !records.attributes.is_empty() {
+        block.attributes = spread(records, &records.attributes, ATTRIBUTES);
     }
     block
 }

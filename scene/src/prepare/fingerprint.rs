@@ -43,11 +43,11 @@ pub fn fingerprint(description: &Description) -> Result<ObjectHash, ImportError>
 pub fn source_files(description: &Description) -> BTreeSet<&Path> {
     let shapes = description.shapes.iter().filter_map(|shape| match &shape.geometry {
         Geometry::MeshFile { path, .. } | Geometry::IsoSurface { path, .. } => Some(path.as_path()),
-        Geometry::Inline { .. } | Geometry::Sphere { .. } => None,
+        Geometry::Inline { .. } | Geometry::Sphere { .. } | Geometry::Part => None,
     });
     let textures = description.textures.iter().filter_map(|texture| match &texture.kind {
         TextureKind::Image { path, .. } => Some(path.as_path()),
-        TextureKind::Checkerboard(_) => None,
+        TextureKind::Checkerboard(_) | TextureKind::Attribute { .. } => None,
     });
     let sky = match &description.environment {
         Some(Environment::Map { path, .. }) => Some(path.as_path()),
@@ -100,10 +100,13 @@ mod tests {
                     format: MeshFormat::Ply,
                     flip_v: false,
                     smooth: false,
+                    attribute: None,
+                    parts: None,
                 },
                 to_world: Affine::IDENTITY,
                 material: 0,
                 emission: None,
+                emission_texture: None,
                 flip_normals: false,
                 face_normals: false,
             }],

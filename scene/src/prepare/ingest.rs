@@ -2,10 +2,10 @@
 
 use rayherd_render::bvh::MAX_COORDINATE;
 use rayherd_render::ray::PrimId;
-use rayherd_render::world::{EmissivePrimitive, Primitive};
+use rayherd_render::world::{EmissivePrimitive, Glow, Primitive};
 
 use super::progress::{PrepareProgress, Stage};
-use super::records::{Extra, NORMALS, Records, SphereBits, UVS};
+use super::records::{ATTRIBUTES, Extra, NORMALS, Records, SphereBits, UVS};
 use super::spool::Spool;
 use super::{PrepareError, SpoolSettings};
 use crate::description::Description;
@@ -40,6 +40,8 @@ pub(crate) struct Ingested {
     /// Box of what does not emit light, inside out if there is nothing.
     dark: Box3,
     pub emissive: Vec<EmissivePrimitive>,
+    /// Of those of them whose shape's emission a texture gives; weights are still to be found.
+    pub glows: Vec<Glow>,
     /// Of all records, whatever the chunks.
     pub hash: blake3::Hash,
 }
@@ -136,16 +138,22 @@ pub(crate) fn ingest(
         hi: [f32::NEG_INFINITY; 3],
         dark: [[f32::INFINITY; 3], [f32::NEG_INFINITY; 3]],
         emissive: Vec::new(),
+        glows: Vec::new(),
         hashers: Default::default(),
     };
     reader.counts.source_bytes = each(source.open()?, Stage::Reading, progress, |record| reader.add(record))?;
     reader.flush()?;
     let mut hasher = blake3::Hasher::new();
-    for part in &reader.hashers {
+    let [always @ .., attributes] = &reader.hashers;
+    for part in always {
         hasher.update(part.finalize().as_bytes());
     }
-    let Reader { spool, counts, lo, hi, dark, emissive, .. } = reader;
-    Ok(Ingested { spool, counts, lo, hi, dark, emissive, hash: hasher.finalize() })
+    // few scenes have any: the hashes of all others stay what they were before
+    if attributes.count() > 0 {
+        hasher.update(attributes.finalize().as_bytes());
+    }
+    let Reader { spool, counts, lo, hi, dark, emissive, glows, .. } = reader;
+    Ok(Ingested { spool, counts, lo, hi, dark, emissive, glows, hash: hasher.finalize() })
 }
 
 /// Whether an emission is light.
@@ -163,8 +171,9 @@ struct Reader<'a> {
     hi: [f32; 3],
     dark: Box3,
     emissive: Vec<EmissivePrimitive>,
+    glows: Vec<Glow>,
     /// One for each array, so that the sum does not depend on where chunks end.
-    hashers: [blake3::Hasher; 7],
+    hashers: [blake3::Hasher; 8],
 }
 
 impl Reader<'_> {
@@ -201,9 +210,13 @@ impl Reader<'_> {
             has |= UVS;
             self.chunk.uvs.push(uv);
         }
+        if let Some(attribute) = t.attribute {
+            has |= ATTRIBUTES;
+            self.chunk.attributes.push(attribute);
+        }
         self.chunk.extras.push(Extra { shape: t.shape, has });
         self.counts.triangles += 1;
-        self.emit(id, t.shape, Primitive::Triangle(p));
+        self.emit(id, t.shape, Primitive::Triangle(p), (t.uv, t.attribute));
         Ok(())
     }
 
@@ -218,7 +231,7 @@ impl Reader<'_> {
         self.chunk.sphere_ids.push(id);
         self.chunk.spheres.push(SphereBits { center, radius, shape: s.shape, flipped: u32::from(s.flipped) });
         self.counts.spheres += 1;
-        self.emit(id, s.shape, Primitive::Sphere { center, radius, flipped: s.flipped });
+        self.emit(id, s.shape, Primitive::Sphere { center, radius, flipped: s.flipped }, (None, None));
         Ok(())
     }
 
@@ -239,9 +252,12 @@ impl Reader<'_> {
         emits(self.description.shapes.get(shape as usize).and_then(|s| s.emission))
     }
 
-    fn emit(&mut self, prim: PrimId, shape: u32, geometry: Primitive) {
+    fn emit(&mut self, prim: PrimId, shape: u32, geometry: Primitive, (uv, attribute): Look) {
         if self.emits(shape) {
             self.emissive.push(EmissivePrimitive { prim, shape, geometry });
+            if self.description.shapes[shape as usize].emission_texture.is_some() {
+                self.glows.push(Glow { prim, uv, attribute, weight: 0.0 });
+            }
         }
     }
 
@@ -250,18 +266,22 @@ impl Reader<'_> {
         if chunk.len() == 0 {
             return Ok(());
         }
-        let [ids, triangles, extras, normals, uvs, sphere_ids, spheres] = &mut self.hashers;
+        let [ids, triangles, extras, normals, uvs, sphere_ids, spheres, attributes] = &mut self.hashers;
         ids.update(bytemuck::cast_slice(&chunk.triangle_ids));
         triangles.update(bytemuck::cast_slice(&chunk.triangles));
         extras.update(bytemuck::cast_slice(&chunk.extras));
         normals.update(bytemuck::cast_slice(&chunk.normals));
         uvs.update(bytemuck::cast_slice(&chunk.uvs));
+        attributes.update(bytemuck::cast_slice(&chunk.attributes));
         sphere_ids.update(bytemuck::cast_slice(&chunk.sphere_ids));
         spheres.update(bytemuck::cast_slice(&chunk.spheres));
         self.spool.push(chunk).map_err(|source| PrepareError::Spool { folder: self.spool.folder().clone(), source })?;
         Ok(())
     }
 }
+
+/// Texture coordinates and attribute.
+type Look = (Option<[[f32; 2]; 3]>, Option<[[f32; 3]; 3]>);
 
 /// Whether a record's numbers can be computed with.
 fn sound(record: &Record) -> Result<(), Skip> {

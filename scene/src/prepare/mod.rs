@@ -37,7 +37,7 @@ use std::time::Duration;
 use rayherd_render::bvh::BuildError;
 use rayherd_render::skip::Skip;
 use rayherd_render::texture::Texture;
-use rayherd_render::world::{Beam, Environment, ShapeInfo, Sun, World};
+use rayherd_render::world::{Beam, Environment, ShapeInfo, Slide, Sun, World};
 use rayon::prelude::*;
 
 use crate::ImportError;
@@ -56,6 +56,7 @@ use counting::CountingStore;
 use incidence::{CellBox, ChosenCells, Incidence, incidence};
 use ingest::Ingested;
 use spool::Spool;
+use textures::Shining;
 
 pub use fingerprint::{fingerprint, source_files};
 pub use progress::{NoProgress, PrepareProgress, Stage};
@@ -175,7 +176,7 @@ pub fn prepare(
 
     // 1, 2
     let (offset, mut ingested) = read(description, source, spool, progress)?;
-    let textures = textures::store(&description.textures, &store)?;
+    let textures = textures::store(&description.textures, shining(description, &mut ingested), &store)?;
     ingested.counts.source_bytes += textures.bytes_read;
     let tiles = textures.tiles;
     let world = world(description, &offset, &mut ingested, textures.textures)?;
@@ -299,12 +300,14 @@ fn world(
         name: s.name.clone(),
         material: s.material,
         emission: s.emission,
+        emission_texture: s.emission_texture,
     });
     let world = World {
         materials: description.materials.clone(),
         textures,
         shapes: shapes.collect(),
         emissive: std::mem::take(&mut ingested.emissive),
+        glows: std::mem::take(&mut ingested.glows),
         beams: description.beams.iter().map(|b| beam(b, offset)).collect(),
         environment: description.environment.as_ref().map(|sky| match sky {
             description::Environment::Constant(radiance) => Environment::Constant(*radiance),
@@ -331,6 +334,20 @@ fn world(
     Ok(world)
 }
 
+/// By texture: the primitives whose emission it gives, to be weighed.
+fn shining<'a>(description: &Description, ingested: &'a mut Ingested) -> Shining<'a> {
+    let mut out = Shining::new();
+    let mut emissive = ingested.emissive.iter();
+    for glow in &mut ingested.glows {
+        // both by ascending id
+        let Some(e) = emissive.find(|e| e.prim == glow.prim) else { break };
+        if let Some(texture) = description.shapes[e.shape as usize].emission_texture {
+            out.entry(texture).or_default().push((glow, e.geometry));
+        }
+    }
+    out
+}
+
 /// A beam in recentred f32.
 fn beam(beam: &description::Beam, offset: &[f64; 3]) -> Beam {
     let place = |p: &[f64; 3]| std::array::from_fn(|i| (p[i] - offset[i]) as f32);
@@ -338,12 +355,17 @@ fn beam(beam: &description::Beam, offset: &[f64; 3]) -> Beam {
         description::Beam::Point { position, intensity } => {
             Beam::Point { position: place(position), intensity: *intensity }
         }
-        description::Beam::Spot { position, axis, intensity, beam, cutoff } => Beam::Spot {
+        description::Beam::Spot { position, axis, intensity, beam, cutoff, slide } => Beam::Spot {
             position: place(position),
             axis: axis.map(|x| x as f32),
             intensity: *intensity,
             beam: beam.to_radians() as f32,
             cutoff: cutoff.to_radians() as f32,
+            slide: slide.as_ref().map(|slide| Slide {
+                texture: slide.texture,
+                to_local: slide.to_local.map(|row| row.map(|x| x as f32)),
+                tan: libm::tan(cutoff.to_radians()) as f32,
+            }),
         },
         description::Beam::Directional { direction, irradiance } => {
             Beam::Directional { direction: direction.map(|x| x as f32), irradiance: *irradiance }

@@ -16,6 +16,8 @@ pub(crate) struct Records {
     pub normals: Vec<[[f32; 3]; 3]>,
     /// Of the triangles that have texture coordinates, in their order.
     pub uvs: Vec<[[f32; 2]; 3]>,
+    /// Of the triangles whose mesh has an attribute, in their order.
+    pub attributes: Vec<[[f32; 3]; 3]>,
     pub sphere_ids: Vec<PrimId>,
     pub spheres: Vec<SphereBits>,
 }
@@ -25,12 +27,13 @@ pub(crate) struct Records {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Pod, Zeroable)]
 pub(crate) struct Extra {
     pub shape: u32,
-    /// [`NORMALS`] and [`UVS`].
+    /// [`NORMALS`], [`UVS`] and [`ATTRIBUTES`].
     pub has: u32,
 }
 
 pub(crate) const NORMALS: u32 = 1;
 pub(crate) const UVS: u32 = 2;
+pub(crate) const ATTRIBUTES: u32 = 4;
 
 /// A sphere in plain bytes.
 #[repr(C)]
@@ -55,7 +58,18 @@ struct At {
     triangle: usize,
     normals: usize,
     uvs: usize,
+    attributes: usize,
     sphere: usize,
+}
+
+impl At {
+    /// Passes a triangle.
+    fn pass(&mut self, extra: Extra) {
+        self.triangle += 1;
+        self.normals += usize::from(extra.has & NORMALS != 0);
+        self.uvs += usize::from(extra.has & UVS != 0);
+        self.attributes += usize::from(extra.has & ATTRIBUTES != 0);
+    }
 }
 
 impl Records {
@@ -69,6 +83,7 @@ impl Records {
             + self.triangles.len() * (8 + 36 + 8)
             + self.normals.len() * 36
             + self.uvs.len() * 24
+            + self.attributes.len() * 36
             + self.spheres.len() * (8 + 24)) as u64
     }
 
@@ -79,16 +94,20 @@ impl Records {
         Some((*first, *last))
     }
 
-    /// Appends triangle `i` of `from`, whose normals and uvs are `normal` and `uv` in theirs.
-    fn push_triangle(&mut self, from: &Records, i: usize, normal: usize, uv: usize) {
+    /// Appends the triangle at a place of `from`.
+    fn push_triangle(&mut self, from: &Records, at: At) {
+        let (i, has) = (at.triangle, from.extras[at.triangle].has);
         self.triangle_ids.push(from.triangle_ids[i]);
         self.triangles.push(from.triangles[i]);
         self.extras.push(from.extras[i]);
-        if from.extras[i].has & NORMALS != 0 {
-            self.normals.push(from.normals[normal]);
+        if has & NORMALS != 0 {
+            self.normals.push(from.normals[at.normals]);
         }
-        if from.extras[i].has & UVS != 0 {
-            self.uvs.push(from.uvs[uv]);
+        if has & UVS != 0 {
+            self.uvs.push(from.uvs[at.uvs]);
+        }
+        if has & ATTRIBUTES != 0 {
+            self.attributes.push(from.attributes[at.attributes]);
         }
     }
 
@@ -104,6 +123,7 @@ impl Records {
         self.extras.extend_from_slice(&other.extras);
         self.normals.extend_from_slice(&other.normals);
         self.uvs.extend_from_slice(&other.uvs);
+        self.attributes.extend_from_slice(&other.attributes);
         self.sphere_ids.extend_from_slice(&other.sphere_ids);
         self.spheres.extend_from_slice(&other.spheres);
     }
@@ -121,6 +141,7 @@ impl Records {
         self.extras.extend_from_slice(&other.extras[t]);
         self.normals.extend_from_slice(&other.normals[begin.normals..end.normals]);
         self.uvs.extend_from_slice(&other.uvs[begin.uvs..end.uvs]);
+        self.attributes.extend_from_slice(&other.attributes[begin.attributes..end.attributes]);
         self.sphere_ids.extend_from_slice(&other.sphere_ids[begin.sphere..end.sphere]);
         self.spheres.extend_from_slice(&other.spheres[begin.sphere..end.sphere]);
     }
@@ -132,12 +153,7 @@ impl Records {
             let triangle = self.triangle_ids.get(at.triangle);
             match (triangle, self.sphere_ids.get(at.sphere)) {
                 (None, None) => break,
-                (Some(t), s) if s.is_none_or(|s| t < s) => {
-                    let has = self.extras[at.triangle].has;
-                    at.normals += usize::from(has & NORMALS != 0);
-                    at.uvs += usize::from(has & UVS != 0);
-                    at.triangle += 1;
-                }
+                (Some(t), s) if s.is_none_or(|s| t < s) => at.pass(self.extras[at.triangle]),
                 _ => at.sphere += 1,
             }
         }
@@ -147,15 +163,12 @@ impl Records {
     /// Copies primitives out: `triangles` and `spheres` are (number, target) pairs by ascending number, each once.
     pub(crate) fn deal(&self, triangles: &[(u32, u32)], spheres: &[(u32, u32)]) -> BTreeMap<u32, Records> {
         let mut out: BTreeMap<u32, Records> = BTreeMap::new();
-        let (mut next, mut normal, mut uv) = (0, 0, 0);
+        let mut at = At::default();
         for &(i, target) in triangles {
-            let i = i as usize;
-            for extra in &self.extras[next..i] {
-                normal += usize::from(extra.has & NORMALS != 0);
-                uv += usize::from(extra.has & UVS != 0);
+            while at.triangle < i as usize {
+                at.pass(self.extras[at.triangle]);
             }
-            next = i;
-            out.entry(target).or_default().push_triangle(self, i, normal, uv);
+            out.entry(target).or_default().push_triangle(self, at);
         }
         for &(i, target) in spheres {
             out.entry(target).or_default().push_sphere(self, i as usize);
@@ -167,24 +180,18 @@ impl Records {
     pub(crate) fn union(&self, other: &Records) -> Records {
         let mut out = Records::default();
         let (mut a, mut b) = (At::default(), At::default());
-        let step = |r: &Records, at: &mut At| {
-            let has = r.extras[at.triangle].has;
-            at.normals += usize::from(has & NORMALS != 0);
-            at.uvs += usize::from(has & UVS != 0);
-            at.triangle += 1;
-        };
         loop {
             match (self.triangle_ids.get(a.triangle), other.triangle_ids.get(b.triangle)) {
                 (None, None) => break,
                 (x, Some(y)) if x.is_none_or(|x| y < x) => {
-                    out.push_triangle(other, b.triangle, b.normals, b.uvs);
-                    step(other, &mut b);
+                    out.push_triangle(other, b);
+                    b.pass(other.extras[b.triangle]);
                 }
                 (x, y) => {
-                    out.push_triangle(self, a.triangle, a.normals, a.uvs);
-                    step(self, &mut a);
+                    out.push_triangle(self, a);
+                    a.pass(self.extras[a.triangle]);
                     if x == y {
-                        step(other, &mut b);
+                        b.pass(other.extras[b.triangle]);
                     }
                 }
             }
@@ -223,11 +230,12 @@ impl Records {
             - shared(&self.sphere_ids, &other.sphere_ids)
     }
 
-    const COUNTS: usize = 4;
+    const COUNTS: usize = 5;
 
     /// The arrays, one after the other, in this machine's byte order (a spool does not outlive its process).
     pub(crate) fn write(&self, out: &mut Vec<u8>) {
-        for count in [self.triangles.len(), self.normals.len(), self.uvs.len(), self.spheres.len()] {
+        let [t, n, uv] = [self.triangles.len(), self.normals.len(), self.uvs.len()];
+        for count in [t, n, uv, self.attributes.len(), self.spheres.len()] {
             out.extend_from_slice(&(count as u64).to_ne_bytes());
         }
         out.extend_from_slice(bytemuck::cast_slice(&self.triangle_ids));
@@ -235,6 +243,7 @@ impl Records {
         out.extend_from_slice(bytemuck::cast_slice(&self.extras));
         out.extend_from_slice(bytemuck::cast_slice(&self.normals));
         out.extend_from_slice(bytemuck::cast_slice(&self.uvs));
+        out.extend_from_slice(bytemuck::cast_slice(&self.attributes));
         out.extend_from_slice(bytemuck::cast_slice(&self.sphere_ids));
         out.extend_from_slice(bytemuck::cast_slice(&self.spheres));
     }
@@ -248,13 +257,14 @@ impl Records {
             *count = usize::try_from(u64::from_ne_bytes(*head)).ok()?;
             rest = tail;
         }
-        let [triangles, normals, uvs, spheres] = counts;
+        let [triangles, normals, uvs, attributes, spheres] = counts;
         let records = Records {
             triangle_ids: take(&mut rest, triangles)?,
             triangles: take(&mut rest, triangles)?,
             extras: take(&mut rest, triangles)?,
             normals: take(&mut rest, normals)?,
             uvs: take(&mut rest, uvs)?,
+            attributes: take(&mut rest, attributes)?,
             sphere_ids: take(&mut rest, spheres)?,
             spheres: take(&mut rest, spheres)?,
         };
@@ -286,12 +296,15 @@ mod tests {
             }
             out.triangle_ids.push(id);
             out.triangles.push([[x; 3]; 3]);
-            out.extras.push(Extra { shape: id as u32, has: (id % 4) as u32 });
+            out.extras.push(Extra { shape: id as u32, has: (id % 8) as u32 });
             if id & 1 != 0 {
                 out.normals.push([[x; 3]; 3]);
             }
             if id & 2 != 0 {
                 out.uvs.push([[x; 2]; 3]);
+            }
+            if id & 4 != 0 {
+                out.attributes.push([[x; 3]; 3]);
             }
         }
         out

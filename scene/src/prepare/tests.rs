@@ -54,6 +54,7 @@ fn description(name: &str) -> Description {
         to_world: Affine::IDENTITY,
         material: 0,
         emission,
+        emission_texture: None,
         flip_normals: false,
         face_normals: false,
     };
@@ -84,6 +85,7 @@ fn scene(seed: u64, count: usize) -> Vec<Record> {
             p: [corner(size), corner(size), corner(size)],
             n: (i % 3 == 0).then_some([[0.0, 0.0, 1.0]; 3]),
             uv: (i % 4 == 0).then_some([[0.25, i as f32]; 3]),
+            attribute: (i % 5 == 0).then_some([[0.5, i as f32, 2.0]; 3]),
             shape: u32::from(i % 50 == 7),
         };
         out.push(match i % 40 {
@@ -358,9 +360,14 @@ fn what_cannot_be_prepared_is_said() {
     let store = MemoryObjects::new();
     let nothing = run(&[], &settings(2, true), &store).unwrap_err();
     assert!(matches!(nothing, PrepareError::Empty { records: 0, .. }));
-    let flat = Record::Triangle(TriangleRecord { p: [[1.0; 3]; 3], n: None, uv: None, shape: 0 });
-    let far =
-        Record::Triangle(TriangleRecord { p: [[1e30, 0.0, 0.0], [0.0; 3], [0.0; 3]], n: None, uv: None, shape: 0 });
+    let flat = Record::Triangle(TriangleRecord { p: [[1.0; 3]; 3], n: None, uv: None, attribute: None, shape: 0 });
+    let far = Record::Triangle(TriangleRecord {
+        p: [[1e30, 0.0, 0.0], [0.0; 3], [0.0; 3]],
+        n: None,
+        uv: None,
+        attribute: None,
+        shape: 0,
+    });
     let empty = run(&[flat, far], &settings(2, true), &store).unwrap_err();
     assert!(matches!(empty, PrepareError::Empty { records: 2, degenerate: 1, out_of_range: 1, .. }), "{empty}");
     assert!(matches!(run(&[flat], &settings(0, true), &store), Err(PrepareError::Settings(_))));
@@ -377,6 +384,7 @@ fn one_primitive_and_flat_scenes_are_scenes() {
             p: [[x, 2.0, 0.0], [x + 1.0, 2.0, 0.0], [x, 2.0, 1.0]],
             n: None,
             uv: None,
+            attribute: None,
             shape: 0,
         })
     };
@@ -471,6 +479,7 @@ fn a_lamp_far_away_does_not_stretch_the_grid() {
             p: [corner(-1.0, -1.0), corner(1.0, -1.0), corner(0.0, 1.0)],
             n: None,
             uv: None,
+            attribute: None,
             shape,
         })
     };

@@ -127,6 +127,7 @@ fn what_cannot_be_done_leaves_no_file() {
             to_world: Affine::IDENTITY,
             material: 0,
             emission: None,
+            emission_texture: None,
             flip_normals: false,
             face_normals: false,
         }],
@@ -137,8 +138,14 @@ fn what_cannot_be_done_leaves_no_file() {
     let mut broken = import_surface(&path, &ImportOptions::default()).unwrap();
     let file = dir.path().join("broken.obj");
     std::fs::write(&file, "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\nf 1 2 9\n").unwrap();
-    broken.shapes[0].geometry =
-        Geometry::MeshFile { path: file, format: MeshFormat::Obj, flip_v: false, smooth: false };
+    broken.shapes[0].geometry = Geometry::MeshFile {
+        path: file,
+        format: MeshFormat::Obj,
+        flip_v: false,
+        smooth: false,
+        attribute: None,
+        parts: None,
+    };
     let source = DescriptionSource::new(&broken, StreamOptions::default());
     refused(interleave(&source, 2, &out), "index 9");
     let mut left: Vec<_> = std::fs::read_dir(dir.path()).unwrap().map(|e| e.unwrap().file_name()).collect();

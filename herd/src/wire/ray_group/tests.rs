@@ -198,8 +198,12 @@ impl Heap {
             let bsdf = Bsdf::Diffuse { reflectance: albedo(i) };
             Material::new("", bsdf, true)
         };
-        let shape =
-            |i: usize| ShapeInfo { name: String::new(), material: i as u32, emission: (i == 1).then_some([20.0; 3]) };
+        let shape = |i: usize| ShapeInfo {
+            name: String::new(),
+            material: i as u32,
+            emission: (i == 1).then_some([20.0; 3]),
+            emission_texture: None,
+        };
         World {
             materials: (0..n).map(material).collect(),
             shapes: (0..n).map(shape).collect(),
@@ -237,7 +241,7 @@ impl Surfaces for Seen<'_> {
     fn surface(&self, _index: usize, hit: &Hit) -> Surface {
         let (center, radius) = self.0.spheres[hit.prim as usize];
         let geometry = Primitive::Sphere { center, radius, flipped: false };
-        Surface { shape: hit.prim, geometry, normals: None, uv: None }
+        Surface { shape: hit.prim, geometry, normals: None, uv: None, attribute: None }
     }
     fn prim(&self, _: usize, hit: &Hit) -> PrimId {
         hit.prim.into()

@@ -1,6 +1,7 @@
 //! Every primitive tried with every ray: the plainest intersector, with the kernel's rules (watertight triangles, ties to the
 //! smaller id).
 
+use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use glam::Vec3;
@@ -14,7 +15,7 @@ use crate::path::reference::Tracer;
 use crate::path::{Surface, Surfaces};
 use crate::ray::{Hit, MISS, PrimId, Ray};
 use crate::texture::{Bitmap, Filter as TexelFilter, Texel, Texture, Tiles, UvMap, Wrap};
-use crate::world::{Beam, EmissivePrimitive, Environment, Primitive, ShapeInfo, World};
+use crate::world::{Beam, EmissivePrimitive, Environment, Glow, Primitive, ShapeInfo, World};
 
 /// A scene in a list.
 #[derive(Default)]
@@ -29,7 +30,11 @@ pub struct Scene {
     pub sky_map: Option<(Arc<SkyMap>, [[f32; 3]; 3])>,
     pub textures: Vec<Texture>,
     pub tiles: Tiles,
+    /// By primitive: its texture coordinates and attribute.
+    pub extras: BTreeMap<u32, Extras>,
 }
+
+type Extras = (Option<[[f32; 2]; 3]>, Option<[[f32; 3]; 3]>);
 
 impl Scene {
     pub fn material(&mut self, bsdf: Bsdf, two_sided: bool) -> u32 {
@@ -46,7 +51,7 @@ impl Scene {
 
     /// A diffuse material whose albedo a texture gives.
     pub fn painted(&mut self, texture: u32) -> u32 {
-        let textured = vec![Textured { slot: Slot::Diffuse, texture }];
+        let textured = vec![Textured::new(Slot::Diffuse, texture)];
         self.detailed(Bsdf::Diffuse { reflectance: [0.0; 3] }, Detail { textured, ..Detail::default() })
     }
 
@@ -70,7 +75,7 @@ impl Scene {
     }
 
     pub fn shape(&mut self, material: u32, emission: Option<[f32; 3]>) -> u32 {
-        self.shapes.push(ShapeInfo { name: String::new(), material, emission });
+        self.shapes.push(ShapeInfo { name: String::new(), material, emission, emission_texture: None });
         self.shapes.len() as u32 - 1
     }
 
@@ -89,7 +94,7 @@ impl Scene {
     }
 
     pub fn world(&self) -> World {
-        let mut emissive = Vec::new();
+        let (mut emissive, mut glows) = (Vec::new(), Vec::new());
         let (mut lo, mut hi) = (Vec3::INFINITY, Vec3::NEG_INFINITY);
         for (i, &(geometry, shape)) in self.primitives.iter().enumerate() {
             match geometry {
@@ -102,12 +107,17 @@ impl Scene {
             if self.shapes[shape as usize].emission.is_some() {
                 emissive.push(EmissivePrimitive { prim: i as u64, shape, geometry });
             }
+            if self.shapes[shape as usize].emission_texture.is_some() {
+                let (uv, attribute) = self.extras.get(&(i as u32)).copied().unwrap_or_default();
+                glows.push(Glow { prim: i as u64, uv, attribute, weight: 1.0 });
+            }
         }
         World {
             materials: self.materials.clone(),
             textures: self.textures.clone(),
             shapes: self.shapes.clone(),
             emissive,
+            glows,
             beams: self.beams.clone(),
             environment: match &self.sky_map {
                 Some((_, to_map)) => Some(Environment::Map { scale: 1.0, to_map: *to_map, upper: false }),
@@ -129,7 +139,8 @@ impl Scene {
 impl Surfaces for Scene {
     fn surface(&self, _index: usize, hit: &Hit) -> Surface {
         let (geometry, shape) = self.primitives[hit.prim as usize];
-        Surface { shape, geometry, normals: self.normals[hit.prim as usize], uv: None }
+        let (uv, attribute) = self.extras.get(&hit.prim).copied().unwrap_or_default();
+        Surface { shape, geometry, normals: self.normals[hit.prim as usize], uv, attribute }
     }
     fn prim(&self, _index: usize, hit: &Hit) -> PrimId {
         hit.prim.into()

@@ -8,7 +8,8 @@ use super::brute::{Scene, frame};
 use super::mean_of;
 use crate::light::SkyMap;
 use crate::material::{Bsdf, Distribution};
-use crate::world::Beam;
+use crate::texture::{Checkerboard, Texture, UvMap};
+use crate::world::{Beam, Slide};
 
 const PI: f64 = std::f64::consts::PI;
 
@@ -51,6 +52,82 @@ fn rectangle_over_a_plane() {
     let found = mean_of(&scene, &frame, 4096);
     println!("{found} {expected}");
     assert!((found / expected - 1.0).abs() < 0.002, "{found} {expected}");
+}
+
+/// The same of which a texture lights two of four quarters; the mesh's attribute; and nothing, by a texture that is dark or negative.
+#[test]
+fn textured_rectangle_over_a_plane() {
+    let corner = DVec3::new(0.3, 1.0, 2.0);
+    let (a, b) = (DVec3::new(1.5, 0.0, 0.0), DVec3::new(0.0, 0.3, 1.0));
+    let part = |s: f64, t: f64, size: f64| {
+        let o = corner + a * s + b * t;
+        let (a, b) = (a * size, b * size);
+        polygon(DVec3::new(0.0, 0.0, 3.0), DVec3::Y, &[o, o + a, o + a + b, o + b])
+    };
+    let squares = Texture::Checkerboard(Checkerboard { to_uv: UvMap::IDENTITY, colors: [[4.0; 3], [0.0; 3]] });
+    let dark = Texture::Checkerboard(Checkerboard { to_uv: UvMap::IDENTITY, colors: [[0.0; 3], [-3.0; 3]] });
+    let quarters = 2.0 * 4.0 * (part(0.0, 0.0, 0.5) + part(0.5, 0.5, 0.5));
+    for (texture, e, tolerance) in [
+        (squares, quarters, 0.004),
+        (Texture::Attribute { scale: 0.5 }, 2.0 * 0.5 * 3.0 * part(0.0, 0.0, 1.0), 0.002),
+        (dark, 0.0, 0.0),
+    ] {
+        let (mut scene, frame) = floor();
+        let black = scene.diffuse(0.0);
+        let light = scene.shape(black, Some([2.0; 3]));
+        scene.textures.push(texture.clone());
+        scene.shapes[light as usize].emission_texture = Some(0);
+        let first = scene.primitives.len() as u32;
+        scene.quad(light, [0.3, 1.0, 2.0], [1.5, 0.0, 0.0], [0.0, 0.3, 1.0]);
+        for (k, uv) in
+            [[[0.0, 0.0], [1.0, 0.0], [1.0, 1.0]], [[0.0, 0.0], [1.0, 1.0], [0.0, 1.0]]].into_iter().enumerate()
+        {
+            scene.extras.insert(first + k as u32, (Some(uv), Some([[3.0; 3]; 3])));
+        }
+        let expected = 0.5 / PI * e;
+        let found = mean_of(&scene, &frame, 8192);
+        println!("{texture:?}: {found} {expected}");
+        assert!((found - expected).abs() <= tolerance * expected, "{texture:?}: {found} {expected}");
+    }
+}
+
+/// A spot's picture: x and y of the light go to u and v.
+#[test]
+fn a_spot_throws_a_picture() {
+    let position = [0.0, 2.0, 3.0f32];
+    for (uv, color) in [([-0.3, -0.3], 0.25), ([0.3, -0.3], 0.5), ([-0.3, 0.3], 0.125), ([0.3, 0.3], 1.0)] {
+        let (mut scene, frame) = floor();
+        // four texels, by rows; the light's x and y are the world's x and z
+        let bytes: Vec<u8> =
+            [0.25, 0.5, 0.125, 1.0].iter().flat_map(|v: &f64| [(v * 255.0).round() as u8; 3]).collect();
+        scene.image([2, 2], bytes);
+        if let Texture::Bitmap(b) = &mut scene.textures[0] {
+            b.filter = crate::texture::Filter::Nearest;
+        }
+        let tan = 0.5f32;
+        // looks beside the point, so that it is seen there
+        let target = Vec3::new(-2.0 * uv[0] * tan, 0.0, 3.0 - 2.0 * uv[1] * tan);
+        let axis = (target - Vec3::from(position)).normalize();
+        let s = Vec3::new(-axis.y, axis.x, 0.0).normalize();
+        let t = s.cross(axis);
+        let t = if t.z < 0.0 { -t } else { t };
+        let to_local = [s.to_array(), t.to_array(), axis.to_array()];
+        let slide = Some(Slide { texture: 0, to_local, tan });
+        let cutoff = libm::atanf(tan);
+        scene.beams.push(Beam::Spot {
+            position,
+            axis: axis.to_array(),
+            intensity: [5.0; 3],
+            beam: cutoff * 0.999,
+            cutoff,
+            slide,
+        });
+        let found = mean_of(&scene, &frame, 4);
+        let color = f64::from((color * 255.0f64).round() as u8) / 255.0;
+        // straight below the light, but for the lift of a ray's origin off a floor 100 wide
+        let expected = 0.5 / PI * 5.0 / 4.0 * color;
+        assert!((found - expected).abs() <= 5e-4 * expected, "{uv:?}: {found} {expected}");
+    }
 }
 
 /// E = pi L (r / d)^2 cos, for a sphere wholly above the horizon: near, small and far ones.
@@ -99,7 +176,7 @@ fn beams_over_a_plane() {
     // turned from the middle of the cone by 0.3
     let axis = (glam::Quat::from_axis_angle(towards.any_orthonormal_vector(), 0.3) * towards).to_array();
     let intensity = [5.0; 3];
-    let spot = |beam, cutoff| Beam::Spot { position, axis, intensity, beam, cutoff };
+    let spot = |beam, cutoff| Beam::Spot { position, axis, intensity, beam, cutoff, slide: None };
     let direction = Vec3::new(0.6, -0.48, 0.64);
     let straight = 5.0 * cos / distance.powi(2);
     let cases = [

@@ -17,6 +17,7 @@ use crate::path::{Context, Outcome, PathRay, ShadowRay, camera_ray, camera_rays,
 use crate::ray::{Hit, PathKey};
 use crate::skip::Skips;
 use crate::testing::Rng;
+use crate::texture::{Checkerboard, Texture, UvMap};
 use crate::world::Beam;
 
 fn channel_means(scene: &Scene, lights: Option<&Lights>, frame: &Frame, samples: u32) -> ([f64; 3], f64) {
@@ -80,6 +81,35 @@ fn estimators_agree() {
     close(mean, roulette, 0.006);
 }
 
+/// The same of lamps whose emission textures give: triangles with texture coordinates, and a sphere.
+#[test]
+fn estimators_agree_on_textured_lamps() {
+    let mut scene = cornell::scene();
+    let image = scene.image([2, 2], vec![255, 10, 30, 0, 90, 255, 128, 0, 128, 255, 255, 0]);
+    let squares = Checkerboard { to_uv: UvMap([[3.0, 0.0, 0.0], [0.0, 2.0, 0.0]]), colors: [[2.0; 3], [0.1; 3]] };
+    scene.textures.push(Texture::Checkerboard(squares));
+    for shape in &mut scene.shapes {
+        shape.emission = None;
+    }
+    let black = scene.diffuse(0.0);
+    let [sheet, ball] = [(image, [3.0, 2.0, 1.0]), (image + 1, [1.0, 2.0, 3.0])].map(|(texture, emission)| {
+        let shape = scene.shape(black, Some(emission));
+        scene.shapes[shape as usize].emission_texture = Some(texture);
+        shape
+    });
+    let first = scene.primitives.len() as u32;
+    scene.quad(sheet, [-0.9, 0.97, -0.9], [1.8, 0.0, 0.0], [0.0, 0.0, 1.8]);
+    scene.extras.insert(first, (Some([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0]]), None));
+    scene.extras.insert(first + 1, (Some([[0.0, 0.0], [1.0, 1.0], [0.0, 1.0]]), None));
+    scene.sphere(ball, [0.2, 0.3, 0.1], 0.3, false);
+    let frame = Frame { max_depth: 4, ..cornell::frame(16) };
+    let (mean, _) = channel_means(&scene, None, &frame, 512);
+    let none = Lights::new(&Scene { shapes: scene.shapes.clone(), ..Scene::default() }.world());
+    let (bsdf_only, _) = channel_means(&scene, Some(&none), &frame, 1024);
+    println!("{mean:?} {bsdf_only:?}");
+    close(mean, bsdf_only, 0.01);
+}
+
 /// The Cornell box with metal, a sphere that emits, a sky, and shading normals: everything that may be in one batch.
 fn motley() -> Scene {
     let mut scene = cornell::scene();
@@ -98,6 +128,10 @@ fn motley() -> Scene {
     let white = scene.diffuse(0.8);
     let lamp = scene.shape(white, Some([2.0; 3]));
     scene.sphere(lamp, [0.5, 0.2, 0.3], 0.1, false);
+    let glow = scene.shape(white, Some([2.0, 1.0, 3.0]));
+    scene.shapes[glow as usize].emission_texture = Some(0);
+    scene.quad(glow, [-0.6, 0.1, 0.2], [0.2, 0.0, 0.0], [0.0, 0.1, 0.2]);
+    scene.sphere(glow, [-0.5, -0.2, 0.3], 0.1, false);
     scene.environment = Some([0.3; 3]);
     let n = scene.normals.len();
     scene.normals[n / 2] = Some([[0.1, 0.2, 1.0]; 3]);
@@ -346,7 +380,7 @@ fn nothing_is_nan() {
             let (place, intensity) = (sizes[(rng.u32() % 5) as usize], [rng.f32(), 0.0, 1e6]);
             let (position, axis) = (rng.vec3(place).to_array(), rng.direction().to_array());
             scene.beams.push(Beam::Point { position, intensity });
-            scene.beams.push(Beam::Spot { position, axis, intensity, beam: 0.5, cutoff: 1.5 });
+            scene.beams.push(Beam::Spot { position, axis, intensity, beam: 0.5, cutoff: 1.5, slide: None });
             scene.beams.push(Beam::Directional { direction: axis, irradiance: intensity });
         }
         let world = scene.world();

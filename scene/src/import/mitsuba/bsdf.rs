@@ -3,7 +3,9 @@
 use super::Converter;
 use super::xml::{ObjectId, Value, malformed};
 use crate::ImportError;
-use crate::description::{Amount, Bsdf, Detail, Distribution, Material, Place, Relief, ReliefKind, Slot, Textured};
+use crate::description::{
+    Amount, Bsdf, Detail, Distribution, Material, Place, Relief, ReliefKind, Slot, TextureKind, Textured,
+};
 use crate::import::metals;
 
 /// Mitsuba's stand-in where a shape names no material, and ours for unsupported ones.
@@ -199,6 +201,10 @@ impl Converter<'_> {
             }
         };
         let Some(texture) = texture else { return Ok(inner) };
+        if plugin == "bumpmap" && matches!(self.out.textures[texture as usize].kind, TextureKind::Attribute { .. }) {
+            self.unsupported(&property.place, "mesh_attribute as a bumpmap", "no relief");
+            return Ok(inner);
+        }
         let relief = Relief { kind, texture, mirrored: false };
         if self.has(&inner, &|d| d.relief.is_some()) {
             self.unsupported(place, format!("{plugin} around another relief"), "the inner relief");
@@ -247,7 +253,7 @@ impl Converter<'_> {
         if let Some(p) = self.property(id, name)
             && let Some(number) = self.texture_of(p, "the grey 0.5")?
         {
-            textured.extend(number.map(|texture| Textured { slot, texture }));
+            textured.extend(number.map(|texture| Textured::new(slot, texture)));
             return Ok(Some([DEFAULT_REFLECTANCE; 3]));
         }
         self.albedo(id, name)
@@ -317,7 +323,7 @@ impl Converter<'_> {
             if let Some(p) = self.property(id, name)
                 && let Some(number) = self.texture_of(p, "0.1")?
             {
-                textured.extend(number.map(|texture| Textured { slot, texture }));
+                textured.extend(number.map(|texture| Textured::new(slot, texture)));
                 return Ok(Some(0.1));
             }
             Ok(self.color(id, name, 0.1)?.map(|v| v[0]))

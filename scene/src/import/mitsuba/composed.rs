@@ -110,7 +110,7 @@ impl Converter<'_> {
     ) -> Result<f32, ImportError> {
         let Some(p) = self.property(id, name) else { return Ok(default) };
         if let Some(number) = self.texture_of(p, &default.to_string())? {
-            textured.extend(number.map(|texture| Textured { slot, texture }));
+            textured.extend(number.map(|texture| Textured::new(slot, texture)));
             return Ok(default);
         }
         let [r, g, b] = self.color(id, name, default.into())?.unwrap_or([default.into(); 3]);

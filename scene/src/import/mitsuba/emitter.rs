@@ -5,15 +5,28 @@ use super::daylight::Daylight;
 use super::shape::is_similarity;
 use super::xml::{ObjectId, malformed};
 use crate::ImportError;
-use crate::description::{Beam, Environment, Place};
-use crate::import::vector::normalize;
+use crate::description::{Affine, Beam, Environment, Place, Slide};
+use crate::import::vector::{cofactors, normalize};
 
 impl Converter<'_> {
-    /// Radiance of an area emitter inside a shape.
-    pub(super) fn area_emitter(&mut self, id: ObjectId) -> Result<[f32; 3], ImportError> {
+    /// Radiance of an area emitter inside a shape, and the texture that it is multiplied by.
+    pub(super) fn area_emitter(&mut self, id: ObjectId) -> Result<([f32; 3], Option<u32>), ImportError> {
         let object = &self.document.objects[id];
+        let mut texture = None;
         let radiance = match object.plugin.as_str() {
-            "area" => self.radiance(id)?.unwrap_or([1.0; 3]),
+            "area" => {
+                let textured = match self.property(id, "radiance") {
+                    Some(p) => self.texture_of(p, "radiance 1")?,
+                    None => None,
+                };
+                match textured {
+                    Some(number) => {
+                        texture = number;
+                        [1.0; 3]
+                    }
+                    None => self.radiance(id)?.unwrap_or([1.0; 3]),
+                }
+            }
             plugin => {
                 self.unsupported(
                     &object.place,
@@ -26,7 +39,7 @@ impl Converter<'_> {
         };
         self.ignore(id, &["sampling_weight"]);
         self.leave(id);
-        Ok(radiance)
+        Ok((radiance, texture))
     }
 
     /// An emitter of the scene itself.
@@ -142,7 +155,30 @@ impl Converter<'_> {
                 // an edge as sharp as floats have it
                 let beam = beam.min(cutoff * (1.0 - 1e-6));
                 let position = finite(map.point([0.0; 3]))?;
-                Beam::Spot { position, axis: unit(along, "to_world")?, intensity, beam, cutoff }
+                let textured = match self.property(id, "texture") {
+                    Some(p) => match self.texture_of(p, "no picture")? {
+                        Some(number) => number,
+                        None => {
+                            self.unsupported(&p.place, "this texture of a spot", "no picture");
+                            None
+                        }
+                    },
+                    None => None,
+                };
+                let slide = match textured {
+                    None => None,
+                    Some(_) if cutoff >= 90.0 => {
+                        return malformed(
+                            place,
+                            format!("cutoff_angle {cutoff} should be below 90 degrees with a texture"),
+                        );
+                    }
+                    Some(texture) => match inverse(&map) {
+                        Some(to_local) => Some(Slide { texture, to_local }),
+                        None => return malformed(place, "the to_world of a spot with a texture cannot be inverted"),
+                    },
+                };
+                Beam::Spot { position, axis: unit(along, "to_world")?, intensity, beam, cutoff, slide }
             }
             _ => {
                 let direction = match self.point(id, "direction")? {
@@ -167,7 +203,7 @@ impl Converter<'_> {
     }
 
     /// Radiance, intensity or irradiance.
-    fn light(&mut self, id: ObjectId, name: &str) -> Result<Option<[f32; 3]>, ImportError> {
+    pub(super) fn light(&mut self, id: ObjectId, name: &str) -> Result<Option<[f32; 3]>, ImportError> {
         let Some(rgb) = self.color(id, name, 1.0)? else { return Ok(None) };
         if rgb.iter().any(|v| *v < 0.0 || *v > f64::from(f32::MAX)) {
             return malformed(
@@ -177,4 +213,12 @@ impl Converter<'_> {
         }
         Ok(Some(rgb.map(|v| v as f32)))
     }
+}
+
+/// The inverse of a map's linear part.
+fn inverse(map: &Affine) -> Option<[[f64; 3]; 3]> {
+    let determinant = map.determinant();
+    let of = cofactors(map);
+    let rows = [0, 1, 2].map(|r| [0, 1, 2].map(|c| of[c][r] / determinant));
+    rows.iter().flatten().all(|x| x.is_finite()).then_some(rows)
 }

@@ -88,7 +88,7 @@ fn lights_without_extent() {
     let look =
         "<transform name=\"to_world\"><lookat origin=\"0, 5, 0\" target=\"0, 3, 0\" up=\"1, 0, 0\"/></transform>";
     let spot = format!("<emitter type=\"spot\">{look}<float name=\"intensity\" value=\"2\"/></emitter>");
-    let Beam::Spot { position, axis, intensity, beam, cutoff } = beams(&spot)[0] else { panic!("no spot") };
+    let Beam::Spot { position, axis, intensity, beam, cutoff, .. } = beams(&spot)[0] else { panic!("no spot") };
     assert_eq!((position, axis, intensity, beam, cutoff), ([0.0, 5.0, 0.0], [0.0, -1.0, 0.0], [2.0; 3], 15.0, 20.0));
     let sharp = spot.replace("<float", "<float name=\"beamWidth\" value=\"20\"/><float");
     let Beam::Spot { beam, .. } = beams(&sharp)[0] else { panic!("no spot") };

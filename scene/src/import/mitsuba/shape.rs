@@ -41,7 +41,7 @@ impl Converter<'_> {
         }
         let mut flip = self.boolean(id, "flip_normals")?.unwrap_or(false);
         let mut face_normals = self.boolean(id, "face_normals")?.unwrap_or(false);
-        let geometry = match object.plugin.as_str() {
+        let mut geometry = match object.plugin.as_str() {
             "rectangle" => Some(shapes::rectangle()),
             "cube" => Some(shapes::cube()),
             "disk" => Some(shapes::disk()),
@@ -73,9 +73,11 @@ impl Converter<'_> {
         if emitters.len() > 1 {
             return malformed(&emitters[1].0.place, "a second emitter in one shape");
         }
-        let mut emission = None;
+        let (mut emission, mut emission_texture) = (None, None);
         for (_, emitter) in emitters {
-            emission = Some(self.area_emitter(emitter)?).filter(|rgb| rgb.iter().any(|v| *v > 0.0));
+            let (radiance, texture) = self.area_emitter(emitter)?;
+            emission = Some(radiance).filter(|rgb| rgb.iter().any(|v| *v > 0.0));
+            emission_texture = texture;
         }
         let bsdfs = self.nested(id, "bsdf")?;
         if bsdfs.len() > 1 {
@@ -87,6 +89,10 @@ impl Converter<'_> {
         };
         self.ignore(id, &["silhouette_sampling_weight"]);
         self.leave(id);
+        let wanted = self.attribute_for(&object.plugin, place, material, emission_texture);
+        if let Some(Geometry::MeshFile { attribute, .. }) = &mut geometry {
+            *attribute = wanted;
+        }
         let Some(geometry) = geometry else { return Ok(()) };
         let name = match (&object.id, &geometry) {
             (Some(id), _) => id.clone(),
@@ -102,6 +108,7 @@ impl Converter<'_> {
             to_world,
             material,
             emission,
+            emission_texture,
             flip_normals: flip,
             face_normals,
         });
@@ -157,7 +164,7 @@ impl Converter<'_> {
                 self.unsupported(&p.place, format!("property \"{name}\" of shape \"{}\"", object.plugin), "nothing");
             }
         }
-        Ok(Some(Geometry::MeshFile { path, format, flip_v, smooth: true }))
+        Ok(Some(Geometry::MeshFile { path, format, flip_v, smooth: true, attribute: None, parts: None }))
     }
 
     /// Mitsuba's sphere: `to_world * translate(center) * scale(radius)`; a mirroring map turns it inside out.

@@ -3,7 +3,7 @@
 use super::Converter;
 use super::xml::{ObjectId, Property, malformed};
 use crate::ImportError;
-use crate::description::{Affine, Checkerboard, TexelFilter, Texture, TextureKind, UvMap, Wrap};
+use crate::description::{Affine, Checkerboard, MeshAttribute, Place, TexelFilter, Texture, TextureKind, UvMap, Wrap};
 use crate::image;
 
 impl Converter<'_> {
@@ -18,14 +18,18 @@ impl Converter<'_> {
         let Some(id) = self.document.object(property)? else { return Ok(None) };
         let object = &self.document.objects[id];
         match (object.class.as_str(), object.plugin.as_str()) {
-            ("texture", "bitmap" | "checkerboard") => {}
+            ("texture", "bitmap" | "checkerboard" | "mesh_attribute") => {}
             _ => return Ok(None),
         }
         if let Some(&known) = self.textures.get(&id) {
             return Ok(Some(known));
         }
         self.enter(id, &property.place)?;
-        let kind = if object.plugin == "bitmap" { self.bitmap(id, stand_in)? } else { self.checkerboard(id)? };
+        let kind = match object.plugin.as_str() {
+            "bitmap" => self.bitmap(id, stand_in)?,
+            "mesh_attribute" => Some(self.attribute(id)?),
+            _ => self.checkerboard(id)?,
+        };
         self.leave(id);
         let number = kind.map(|kind| {
             // the same file, looked at the same way, is one texture
@@ -97,9 +101,66 @@ impl Converter<'_> {
     }
 
     fn checkerboard(&mut self, id: ObjectId) -> Result<Option<TextureKind>, ImportError> {
-        let first = self.albedo(id, "color0")?.unwrap_or([0.4; 3]);
-        let second = self.albedo(id, "color1")?.unwrap_or([0.2; 3]);
+        // of a lamp they may be beyond 1
+        let first = self.light(id, "color0")?.unwrap_or([0.4; 3]);
+        let second = self.light(id, "color1")?.unwrap_or([0.2; 3]);
         Ok(Some(TextureKind::Checkerboard(Checkerboard { to_uv: self.uv_map(id)?, colors: [first, second] })))
+    }
+
+    /// Mitsuba 3's `mesh_attribute`.
+    fn attribute(&mut self, id: ObjectId) -> Result<TextureKind, ImportError> {
+        let place = &self.document.objects[id].place;
+        let Some((name, at)) = self.string(id, "name")? else {
+            return malformed(place, "a mesh_attribute lacks its name");
+        };
+        if attribute_of(name).is_none() {
+            return malformed(at, format!("\"{name}\" should begin with vertex_ or face_, and go on"));
+        }
+        let scale = self.float(id, "scale")?.unwrap_or(1.0) as f32;
+        if !scale.is_finite() {
+            return malformed(place, "the scale of a mesh_attribute is too large");
+        }
+        Ok(TextureKind::Attribute { name: name.into(), scale })
+    }
+
+    /// What a shape's file must be read for: the attribute that its material or its emission names. There is room for one.
+    pub(super) fn attribute_for(
+        &mut self,
+        plugin: &str,
+        place: &Place,
+        material: u32,
+        emission: Option<u32>,
+    ) -> Option<MeshAttribute> {
+        let mut names: Vec<String> = vec![];
+        let mut open = vec![material];
+        let mut textures: Vec<u32> = vec![];
+        while let Some(n) = open.pop() {
+            let Some(detail) = &self.out.materials[n as usize].detail else { continue };
+            open.extend(detail.materials());
+            textures.extend(detail.textures());
+        }
+        for n in textures.into_iter().chain(emission) {
+            if let TextureKind::Attribute { name, .. } = &self.out.textures[n as usize].kind
+                && !names.contains(name)
+            {
+                names.push(name.clone());
+            }
+        }
+        let first = names.first()?;
+        let wanted = attribute_of(first);
+        if plugin != "ply" {
+            self.unsupported(
+                place,
+                format!("mesh attribute \"{first}\" of shape \"{plugin}\", which has none"),
+                "black",
+            );
+            return None;
+        }
+        if let Some(other) = names.get(1) {
+            let what = format!("mesh attribute \"{other}\" beside \"{first}\" on one shape");
+            self.unsupported(place, what, "the first of them");
+        }
+        wanted
     }
 
     /// `to_uv`: x and y of a map in space. In 0.5 and 0.6 offsets and scales, which Mitsuba 3 reads as: first the offset, then the scale.
@@ -120,4 +181,12 @@ impl Converter<'_> {
         }
         Ok(UvMap(rows))
     }
+}
+
+/// The attribute that a name stands for.
+fn attribute_of(name: &str) -> Option<MeshAttribute> {
+    let of_faces = name.starts_with("face_");
+    let rest = name.strip_prefix(if of_faces { "face_" } else { "vertex_" }).filter(|rest| !rest.is_empty())?;
+    // whole numbers are not brought into [0, 1], as Mitsuba does not (it warns)
+    Some(MeshAttribute { of_faces, name: rest.into(), srgb: false })
 }

@@ -4,8 +4,8 @@ use std::path::Path;
 
 use crate::ImportError;
 use crate::description::{
-    Amount, Bsdf, Description, Detail, Material, Relief, ReliefKind, Slot, TexelFilter, Texture, TextureKind, Textured,
-    UvMap, Wrap,
+    Amount, Beam, Bsdf, Description, Detail, Geometry, Material, MeshAttribute, Relief, ReliefKind, Slot, TexelFilter,
+    Texture, TextureKind, Textured, UvMap, Wrap,
 };
 use crate::import::tests::folder;
 use crate::import::{ImportOptions, import};
@@ -43,7 +43,7 @@ fn detail(material: &Material) -> &Detail {
 }
 
 fn textured(slot: Slot, texture: u32) -> Textured {
-    Textured { slot, texture }
+    Textured::new(slot, texture)
 }
 
 #[test]
@@ -208,4 +208,112 @@ fn what_is_missing_or_wrong_is_listed() {
         assert!(error.contains(what) && error.contains("s.xml:2"), "{bsdf}: {error}");
     }
     assert!(!Path::new("a.hdr").exists());
+}
+
+/// A triangle whose vertices have red, and its face a heat.
+const PLY: &str = "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\nproperty float r\n\
+                   property float g\nproperty float b\nelement face 1\nproperty list uchar int vertex_indices\nproperty float heat_x\n\
+                   end_header\n0 0 0 1 0 0\n1 0 0 1 0 0\n0 1 0 1 0 0\n3 0 1 2 7\n";
+
+fn with_mesh(inside: &str, substitute: bool) -> Result<Description, ImportError> {
+    let folder = folder();
+    std::fs::write(folder.path().join("m.ply"), PLY).unwrap();
+    std::fs::write(folder.path().join("m.obj"), "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n").unwrap();
+    let text = format!("<scene version=\"3.0.0\">\n{inside}\n</scene>");
+    let path = folder.path().join("s.xml");
+    std::fs::write(&path, text).unwrap();
+    import(&path, &ImportOptions { sky: Some([1.0; 3]), substitute, ..ImportOptions::default() })
+}
+
+fn attribute(parameter: &str, name: &str) -> String {
+    format!(
+        "<texture type=\"mesh_attribute\" name=\"{parameter}\"><string name=\"name\" value=\"{name}\"/>\
+         <float name=\"scale\" value=\"0.5\"/></texture>"
+    )
+}
+
+fn mesh(file: &str, inside: &str) -> String {
+    let plugin = &file[file.len() - 3..];
+    format!("<shape type=\"{plugin}\"><string name=\"filename\" value=\"{file}\"/>\n{inside}</shape>")
+}
+
+#[test]
+fn attributes_are_what_the_mesh_is_read_for() {
+    let diffuse = |name| format!("<bsdf type=\"diffuse\">{}</bsdf>", attribute("reflectance", name));
+    let out = with_mesh(&mesh("m.ply", &diffuse("vertex_color")), false).unwrap();
+    assert_eq!(out.textures[0].kind, TextureKind::Attribute { name: "vertex_color".into(), scale: 0.5 });
+    assert_eq!(detail(&out.materials[0]).textured, [textured(Slot::Diffuse, 0)]);
+    let wanted = |out: &Description| {
+        let Geometry::MeshFile { attribute, .. } = &out.shapes[0].geometry else { panic!() };
+        attribute.clone().unwrap()
+    };
+    assert_eq!(wanted(&out), MeshAttribute { of_faces: false, name: "color".into(), srgb: false });
+    // inside of others, and as light
+    let inside = format!(
+        "<bsdf type=\"twosided\"><bsdf type=\"mask\"><float name=\"opacity\" value=\"0.5\"/>{}</bsdf></bsdf>",
+        diffuse("face_heat")
+    );
+    assert_eq!(wanted(&with_mesh(&mesh("m.ply", &inside), false).unwrap()).name, "heat");
+    let light = format!("<emitter type=\"area\">{}</emitter>", attribute("radiance", "face_heat"));
+    let out = with_mesh(&mesh("m.ply", &light), false).unwrap();
+    assert!(
+        wanted(&out).of_faces && out.shapes[0].emission == Some([1.0; 3]) && out.shapes[0].emission_texture == Some(0)
+    );
+
+    let two = format!("{}{light}", diffuse("vertex_color"));
+    let bump = format!("<bsdf type=\"bumpmap\"><bsdf type=\"diffuse\"/>{}</bsdf>", attribute("", "vertex_color"));
+    for (scene, what) in [
+        (
+            mesh("m.obj", &diffuse("vertex_color")),
+            "s.xml:2: mesh attribute \"vertex_color\" of shape \"obj\", which has none",
+        ),
+        (mesh("m.ply", &two), "mesh attribute \"face_heat\" beside \"vertex_color\" on one shape"),
+        (mesh("m.ply", &bump), "mesh_attribute as a bumpmap"),
+    ] {
+        let error = with_mesh(&scene, false).unwrap_err().to_string();
+        assert!(error.contains(what), "{error}");
+        assert_eq!(with_mesh(&scene, true).unwrap().substitutions.len(), 1);
+    }
+    for (name, what) in [("color", "should begin with vertex_ or face_"), ("vertex_", "should begin with")] {
+        let error = with_mesh(&mesh("m.ply", &diffuse(name)), false).unwrap_err().to_string();
+        assert!(error.contains("s.xml:3") && error.contains(what), "{error}");
+    }
+    let unnamed = diffuse("vertex_color").replace("<string name=\"name\" value=\"vertex_color\"/>", "");
+    assert!(with_mesh(&mesh("m.ply", &unnamed), false).unwrap_err().to_string().contains("lacks its name"));
+    // what the file lacks is found when it is read
+    let out = with_mesh(&mesh("m.ply", &diffuse("vertex_tone")), false);
+    assert!(out.unwrap_err().to_string().contains("no properties tone_x tone_y tone_z"));
+}
+
+#[test]
+fn light_may_be_textured() {
+    let area = format!("<emitter type=\"area\">{}</emitter>", bitmap("radiance", ""));
+    let out = scene(&shape(&area));
+    assert_eq!((out.shapes[0].emission, out.shapes[0].emission_texture), (Some([1.0; 3]), Some(0)));
+    assert!(matches!(&out.textures[0].kind, TextureKind::Image { raw: false, .. }));
+    let squares = "<emitter type=\"area\"><texture type=\"checkerboard\" name=\"radiance\"><rgb name=\"color0\" value=\"5, 6, 7\"/></texture></emitter>";
+    let out = scene(&shape(squares));
+    let TextureKind::Checkerboard(c) = &out.textures[0].kind else { panic!() };
+    assert_eq!(c.colors, [[5.0, 6.0, 7.0], [0.2; 3]]);
+    let missing = area.replace("a.hdr", "none.hdr");
+    let error = scene_with(&shape(&missing), false).unwrap_err().to_string();
+    assert!(error.contains("s.xml:2: texture file \"none.hdr\" (there is no such file)"), "{error}");
+    let out = scene_with(&shape(&missing), true).unwrap();
+    assert_eq!((out.shapes[0].emission, out.shapes[0].emission_texture), (Some([1.0; 3]), None));
+    let negative = squares.replace("5, 6", "5, -6");
+    assert!(scene_with(&shape(&negative), false).unwrap_err().to_string().contains("should be at least 0"));
+
+    let spot = |more: &str| {
+        let map = "<transform name=\"to_world\"><scale value=\"2\"/><lookat origin=\"0,0,0\" target=\"0,0,-1\" up=\"0,1,0\"/></transform>";
+        let picture = bitmap("texture", "");
+        scene_with(&format!("{}<emitter type=\"spot\">{map}{picture}{more}</emitter>", shape("")), false)
+    };
+    let out = spot("").unwrap();
+    let Beam::Spot { slide: Some(slide), .. } = &out.beams[0] else { panic!("{:?}", out.beams) };
+    // looks along -z: half of each direction, as it is twice as large
+    let expected = [[-0.5, 0.0, 0.0], [0.0, 0.5, 0.0], [0.0, 0.0, -0.5]];
+    let off = slide.to_local.iter().flatten().zip(expected.iter().flatten()).map(|(a, b): (&f64, &f64)| (a - b).abs());
+    assert!(slide.texture == 0 && off.fold(0.0, f64::max) < 1e-12, "{slide:?}");
+    let error = spot("<float name=\"cutoff_angle\" value=\"90\"/>").unwrap_err().to_string();
+    assert!(error.contains("below 90 degrees with a texture"), "{error}");
 }

@@ -1,7 +1,7 @@
 use crate::ImportError;
-use crate::description::MeshFormat;
-use crate::import::StreamOptions;
+use crate::description::{Geometry, MeshAttribute, MeshFormat, Slot, TextureKind, Textured};
 use crate::import::tests::{folder, mesh_shape, records, records_with, triangles, write};
+use crate::import::{ImportOptions, StreamOptions, import};
 use crate::record::{Record, TriangleRecord};
 
 /// A quad and a triangle, with extra elements and properties, in an odd order.
@@ -186,4 +186,84 @@ fn errors_name_the_place() {
     );
     let long = format!("ply\n{}", "x".repeat(1 << 20));
     assert!(triangles(&write(&dir, "h.ply", long), MeshFormat::Ply).unwrap_err().to_string().contains("line longer"));
+}
+
+/// A triangle and a quad with colours of vertices and of faces.
+fn colored(vertex: &str, values: [&str; 4], face: &str, faces: [&str; 2]) -> String {
+    let mut text = format!(
+        "ply\nformat ascii 1.0\nelement vertex 4\nproperty float x\nproperty float y\nproperty float z\n{vertex}element face 2\n\
+         {face}end_header\n"
+    );
+    for (place, value) in ["0 0 0", "1 0 0", "1 1 0", "0 1 0"].iter().zip(values) {
+        text += &format!("{place} {value}\n");
+    }
+    text + &faces.join("\n") + "\n"
+}
+
+fn attributes(text: &str, name: &str, of_faces: bool, srgb: bool) -> Result<Vec<[[f32; 3]; 3]>, ImportError> {
+    let dir = folder();
+    let mut description = mesh_shape(&write(&dir, "a.ply", text), MeshFormat::Ply, true);
+    if let Geometry::MeshFile { attribute, .. } = &mut description.shapes[0].geometry {
+        *attribute = Some(MeshAttribute { of_faces, name: name.into(), srgb });
+    }
+    let value = |r: &Record| if let Record::Triangle(t) = r { t.attribute.unwrap() } else { unreachable!() };
+    Ok(records(&description)?.iter().map(value).collect())
+}
+
+#[test]
+fn colours_of_vertices_and_faces() {
+    let list = "property list uchar int vertex_indices\n";
+    let bytes = "property uchar red\nproperty uchar green\nproperty uchar blue\nproperty uchar alpha\n";
+    let four = ["255 0 51 9", "0 0 0 9", "255 255 255 9", "1 2 3 9"];
+    let text = colored(bytes, four, list, ["3 0 1 2", "4 0 1 2 3"]);
+    let found = attributes(&text, "color", false, true).unwrap();
+    assert_eq!(found.len(), 3);
+    let srgb = |v: f64| rayherd_render::texture::decode_srgb(v / 255.0) as f32;
+    assert_eq!(found[0], [[1.0, 0.0, srgb(51.0)], [0.0; 3], [1.0; 3]]);
+    assert_eq!(found[2], [found[0][0], [1.0; 3], [srgb(1.0), srgb(2.0), srgb(3.0)]]);
+    // as Mitsuba has them: whole numbers stay what they are
+    assert_eq!(attributes(&text, "color", false, false).unwrap()[0][0], [255.0, 0.0, 51.0]);
+    // of faces, before and behind the list; the second face is fanned
+    for before in [true, false] {
+        let colors = "property float r\nproperty float g\nproperty float b\n";
+        let (face, faces) = match before {
+            true => (format!("{colors}{list}"), ["0.1 0.2 0.3 3 0 1 2", "0.5 nan 1e9 4 0 1 2 3"]),
+            false => (format!("{list}{colors}"), ["3 0 1 2 0.1 0.2 0.3", "4 0 1 2 3 0.5 nan 1e9"]),
+        };
+        let found = attributes(&colored("", [""; 4], &face, faces), "color", true, false).unwrap();
+        assert_eq!((found.len(), found[0]), (3, [[0.1, 0.2, 0.3]; 3]));
+        assert!(found[1..].iter().flatten().all(|c| c[0] == 0.5 && c[1].is_nan() && c[2] == 1e9), "{found:?}");
+    }
+    // names with a stem; one number stands for three
+    let three = "property float heat_x\nproperty float heat_y\nproperty float heat_z\nproperty float tone_r\n";
+    let text = colored(three, ["1 2 3 4"; 4], list, ["3 0 1 2", "3 0 2 3"]);
+    assert_eq!(attributes(&text, "heat", false, false).unwrap(), [[[1.0, 2.0, 3.0]; 3]; 2]);
+    assert_eq!(attributes(&text, "color_tone", false, false).unwrap()[1], [[4.0; 3]; 3]);
+    let error = attributes(&text, "color", false, false).unwrap_err().to_string();
+    assert!(error.contains("a.ply:") && error.contains("r g b or red green blue"), "{error}");
+    let error = attributes(&text, "heat", true, false).unwrap_err().to_string();
+    assert!(error.contains("element face has no properties heat_x heat_y heat_z"), "{error}");
+    let cut = &text[..text.len() - 12];
+    assert!(attributes(cut, "heat", false, false).unwrap_err().to_string().contains("truncated"));
+}
+
+#[test]
+fn a_bare_mesh_has_its_colours() {
+    let dir = folder();
+    let list = "property list uchar int vertex_indices\n";
+    let colors = "property uchar red\nproperty uchar green\nproperty uchar blue\n";
+    let path = write(&dir, "a.ply", colored(colors, ["9 9 9"; 4], list, ["3 0 1 2", "3 0 2 3"]));
+    let out = import(&path, &ImportOptions::default()).unwrap();
+    let material = &out.materials[out.shapes[0].material as usize];
+    assert_eq!(material.detail.as_ref().unwrap().textured, [Textured::new(Slot::Diffuse, 0)]);
+    assert!(matches!(out.textures[0].kind, TextureKind::Attribute { .. }) && out.textures.len() == 1);
+    assert!(matches!(records(&out).unwrap()[0], Record::Triangle(TriangleRecord { attribute: Some(_), .. })));
+    let options = ImportOptions { albedo: Some([0.5; 3]), ..ImportOptions::default() };
+    assert!(import(&path, &options).unwrap().textures.is_empty());
+    // of faces where vertices have none
+    let faces = format!("{list}{colors}");
+    let path = write(&dir, "b.ply", colored("", [""; 4], &faces, ["3 0 1 2 1 2 3", "3 0 2 3 4 5 6"]));
+    let out = import(&path, &ImportOptions::default()).unwrap();
+    let Geometry::MeshFile { attribute: Some(a), .. } = &out.shapes[0].geometry else { panic!() };
+    assert!(a.of_faces && a.srgb);
 }
