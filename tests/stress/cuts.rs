@@ -12,12 +12,12 @@ const SOUP: usize = 96;
 /// Rays through it.
 const RAYS: usize = 256;
 
-fn power(random: &mut Random, least: i32, most: i32) -> f32 {
+pub fn power(random: &mut Random, least: i32, most: i32) -> f32 {
     2f32.powi(least + random.below((most - least + 1) as usize) as i32)
 }
 
 /// Any triangle, needles down to 1e-8, flat ones along an axis, points and lines, copies of others under ids of their own, neighbours.
-fn soup(random: &mut Random, scale: f32) -> Vec<Triangle> {
+pub fn soup(random: &mut Random, scale: f32) -> Vec<Triangle> {
     let mut out: Vec<Triangle> = Vec::with_capacity(SOUP);
     while out.len() < SOUP {
         let at = point(random);

@@ -1,9 +1,12 @@
 //! Closed meshes of every size, near the origin and far from it: no ray gets out of one.
 
+use rayherd_render::bvh::Forest;
 use rayherd_render::ray::Ray;
 use rayherd_tests::mutation::Random;
 
 use super::numbers::*;
+use super::scenes::{self, Wide};
+use rayherd_scene::prepare::{Cut, PrepareSettings};
 
 /// Faces of a cube's sides are divided so often.
 const SIDE: usize = 24;
@@ -21,7 +24,12 @@ enum Form {
 
 /// A mesh of `size` around `center`: each vertex is rounded once, so neighbours share it to the bit.
 fn mesh(form: Form, size: f64, center: [f64; 3]) -> Vec<Triangle> {
-    let at = |face: usize, i: usize, j: usize| -> [f32; 3] {
+    wide(form, size, center).into_iter().map(|t| t.map(|p| p.map(|x| x as f32))).collect()
+}
+
+/// The same before it is rounded.
+fn wide(form: Form, size: f64, center: [f64; 3]) -> Vec<Wide> {
+    let at = |face: usize, i: usize, j: usize| -> [f64; 3] {
         let (a, b) = (i as f64 / SIDE as f64 * 2.0 - 1.0, j as f64 / SIDE as f64 * 2.0 - 1.0);
         let s = if face & 1 == 0 { 1.0 } else { -1.0 };
         let v: [f64; 3] = match face >> 1 {
@@ -36,7 +44,7 @@ fn mesh(form: Form, size: f64, center: [f64; 3]) -> Vec<Triangle> {
             Form::Bumpy => n.map(|x| x * (1.0 + 0.05 * libm::sin(9.0 * n[0]) * libm::cos(7.0 * n[1]))),
             Form::Disk => [n[0], n[1], n[2] * FLAT],
         };
-        std::array::from_fn(|c| (center[c] + size * p[c]) as f32)
+        std::array::from_fn(|c| center[c] + size * p[c])
     };
     let mut out = Vec::with_capacity(12 * SIDE * SIDE);
     for face in 0..6 {
@@ -159,4 +167,80 @@ fn rays_within_a_face_still_meet_what_is_beyond() {
             assert!(hit.is_hit(), "{:?} {ray:?}", tracer.kernel());
         }
     }
+}
+
+/// Traces rays in every kernel, closest and any; how many were traced. None may get out.
+fn must_hit(what: &str, forest: &Forest, rays: &[Ray]) -> u64 {
+    for tracer in &mut kernels() {
+        let hits = closest(tracer, forest, rays);
+        let occluded = any(tracer, forest, rays);
+        let out = hits.iter().zip(&occluded).filter(|(hit, any)| !hit.is_hit() || !**any).count();
+        let first = rays.iter().zip(&hits).find(|(_, hit)| !hit.is_hit());
+        assert!(out == 0, "{:?} {what}: {out} of {} rays got out, first {first:?}", tracer.kernel(), rays.len());
+    }
+    rays.len() as u64
+}
+
+/// Sources in f64 up to a million sizes from their origin, on the whole way: recentred, rounded, cut, with copies, as blocks.
+#[test]
+fn nothing_gets_out_of_a_mesh_far_from_its_origin() {
+    let sizes = [1e-6, 1e-3, 1.0, 1e3, 1e6];
+    let distances = [1e3, 1e6];
+    let forms = [Form::Cube, Form::Bumpy, Form::Disk];
+    let cases = (sizes.len() * distances.len() * forms.len()) as u64;
+    let each = rays(60_000).div_ceil(cases);
+    let mut random = Random::new(43);
+    let mut traced = 0;
+    for form in forms {
+        for size in sizes {
+            for distance in distances {
+                // blocks hold coordinates below 2^40; recentring needs the source's to be below 2^39
+                let distance = f64::min(distance, 5e11 / size);
+                let center = [0.48, -0.6, 0.64].map(|x| x * distance * size);
+                let source = wide(form, size, center);
+                let description = scenes::under_a_sky(vec![scenes::shape(&source, 0, None)], Some([1.0; 3]));
+                let settings =
+                    PrepareSettings { cut: Cut::Splits(1 + random.below(9) as u32), ..PrepareSettings::default() };
+                let (manifest, objects) = scenes::prepared(&description, &settings);
+                let forest = scenes::whole(&manifest, &objects);
+                let triangles = scenes::rounded(&source, manifest.offset);
+                let mut left = each;
+                while left > 0 {
+                    let n = left.min(1 << 16);
+                    left -= n;
+                    let rays: Vec<Ray> =
+                        (0..n).filter_map(|_| from_inside(&mut random, &triangles, form, size, [0.0; 3])).collect();
+                    traced += must_hit(&format!("{form:?} {size} x{distance}"), &forest, &rays);
+                }
+            }
+        }
+    }
+    println!("{traced} rays, none got out");
+    assert!(traced > each * cases / 2, "{traced}");
+}
+
+/// A mesh in a scene that is up to 3e5 times as large: f32 has a hundred numbers for it, and boxes tell little. (Further on rounding leaves triangles no area,
+/// which are skipped.)
+#[test]
+fn nothing_gets_out_of_a_small_mesh_in_a_large_scene() {
+    let each = rays(2_000).div_ceil(2);
+    let mut random = Random::new(44);
+    let mut traced = 0;
+    for distance in [3e4, 3e5] {
+        let source = wide(Form::Bumpy, 1.0, [0.48, -0.6, 0.64].map(|x| x * distance));
+        let mut all = source.clone();
+        // so that the box's centre is far away
+        all.push([[-distance, 0.0, 0.0], [-distance, 1.0, 0.0], [-distance, 0.0, 1.0]]);
+        let description = scenes::under_a_sky(vec![scenes::shape(&all, 0, None)], Some([1.0; 3]));
+        let settings = PrepareSettings { cut: Cut::Splits(3), ..PrepareSettings::default() };
+        let (manifest, objects) = scenes::prepared(&description, &settings);
+        let forest = scenes::whole(&manifest, &objects);
+        let triangles = scenes::rounded(&source, manifest.offset);
+        let center = std::array::from_fn(|a| [0.48, -0.6, 0.64][a] * distance - manifest.offset[a]);
+        let rays: Vec<Ray> =
+            (0..each).filter_map(|_| from_inside(&mut random, &triangles, Form::Bumpy, 1.0, center)).collect();
+        println!("at {distance}: {:?}", manifest.counts);
+        traced += must_hit(&format!("x{distance}"), &forest, &rays);
+    }
+    println!("{traced} rays, none got out");
 }

@@ -15,13 +15,24 @@ use super::{View, Window, auto};
 ///
 /// Stays with the cut that `view` has unless another one is cheaper, all its loading included.
 pub fn choose(view: &View) -> Vec<Window> {
-    let candidates = candidates(view);
-    let present = candidates.iter().find(|c| *c == view.cut);
-    let best = candidates.iter().map(|c| (cost(view, c), c)).min_by(|a, b| a.0.total_cmp(&b.0));
-    match (best, present) {
-        (Some((best, _)), Some(present)) if cost(view, present) <= best => present.clone(),
-        (Some((_, cut)), _) => cut.clone(),
-        (None, _) => Vec::new(),
+    let mut candidates = candidates(view);
+    let bounds: Vec<f64> = candidates.iter().map(|c| ways(view, c)).collect();
+    let mut order: Vec<usize> = (0..candidates.len()).collect();
+    order.sort_by(|&a, &b| bounds[a].total_cmp(&bounds[b]));
+    let mut costs = vec![f64::INFINITY; candidates.len()];
+    let mut least = f64::INFINITY;
+    for i in order {
+        // what rays on their way cost is a part of what a cut costs: this one cannot be cheaper, nor can those after it
+        if bounds[i] > least {
+            break;
+        }
+        costs[i] = cost(view, &candidates[i]);
+        least = least.min(costs[i]);
+    }
+    let present = candidates.iter().position(|c| *c == view.cut).filter(|&i| costs[i] <= least);
+    match present.or_else(|| costs.iter().position(|&c| c <= least)) {
+        Some(best) => candidates.swap_remove(best),
+        None => Vec::new(),
     }
 }
 
@@ -59,11 +70,17 @@ pub(super) fn candidates(view: &View) -> Vec<Vec<Window>> {
 fn at_home(view: &View) -> Option<Vec<Window>> {
     let count = view.splits.len() as u32;
     let mut covered = vec![false; view.splits.len()];
+    // by node: the splits of which it is the first holder, and those that it holds else
+    let mut disks: Vec<[Vec<u32>; 2]> = vec![Default::default(); view.nodes.len()];
+    for (s, split) in (0u32..).zip(view.splits) {
+        for (k, &n) in split.holders.iter().enumerate() {
+            if let Some(disk) = disks.get_mut(n as usize).filter(|_| !split.holders[..k].contains(&n)) {
+                disk[usize::from(k > 0)].push(s);
+            }
+        }
+    }
     let mut windows: Vec<Window> = Vec::new();
-    for (n, node) in (0u32..).zip(view.nodes).filter(|(_, node)| node.slots > 0) {
-        let held = |s: &u32| view.splits[*s as usize].holders.contains(&n);
-        let first = |s: &u32| view.splits[*s as usize].holders.first() == Some(&n);
-        let (own, mut others): (Vec<u32>, Vec<u32>) = (0..count).filter(held).partition(first);
+    for ([own, mut others], node) in disks.into_iter().zip(view.nodes).filter(|(_, node)| node.slots > 0) {
         let after = own.last().map_or(0, |&s| s + 1);
         others.sort_by_key(|&s| (s + count - after) % count);
         let mut left = node.memory.min(view.forest);
@@ -96,10 +113,13 @@ fn bytes(sizes: &[u64], window: &[u32]) -> u64 {
 /// Parts of about equal bytes: a split belongs to the part that its middle is in, the rule by which copies are placed.
 fn equal(sizes: &[u64], parts: usize) -> Vec<Window> {
     let total = sizes.iter().map(|&s| u128::from(s)).sum::<u128>().max(1);
+    // division of 128 bits is slow, and hardly ever needed
+    let small = u64::try_from(total * parts as u128).is_ok();
     let mut cut: Vec<Window> = Vec::new();
     let (mut before, mut last) = (0, None);
     for (s, &size) in (0u32..).zip(sizes) {
-        let part = (before + u128::from(size) / 2) * parts as u128 / total;
+        let middle = (before + u128::from(size) / 2) * parts as u128;
+        let part = if small { u128::from(middle as u64 / total as u64) } else { middle / total };
         before += u128::from(size);
         match cut.last_mut() {
             Some(window) if last == Some(part) => window.push(s),
@@ -132,13 +152,18 @@ fn full(sizes: &[u64], memory: u64) -> Vec<Window> {
 
 /// Bytes moved with a cut, and time of slots that stand idle, until the work in sight is done.
 pub(super) fn cost(view: &View, cut: &[Window]) -> f64 {
-    let (load, times) = auto::Windows::new(view, cut).tried_out(view);
+    let (load, times) = auto::Windows::new(view, cut, cut == view.cut).tried_out(view);
     let longest = times.iter().copied().fold(0.0, f64::max);
     let slots = |n: usize| f64::from(view.nodes[n].slots.max(1));
     let idle: f64 = times.iter().enumerate().map(|(n, t)| slots(n) * (longest - t)).sum();
+    load + ways(view, cut) + idle * RAY as f64
+}
+
+/// Bytes moved by rays on their way between the windows of a cut.
+fn ways(view: &View, cut: &[Window]) -> f64 {
     let waiting: u64 = view.waiting.values().flatten().map(|g| g.rays).sum();
     let camera: u64 = view.camera.values().sum();
     let rays = waiting as f64 + camera as f64 * view.traffic.rays_per_camera();
     let hops = rays * view.traffic.hops_per_ray(parts(view.splits.iter().map(|s| s.bytes), cut));
-    load + hops * view.traffic.hop(view.replicas) + idle * RAY as f64
+    hops * view.traffic.hop(view.replicas)
 }

@@ -70,12 +70,15 @@ pub(super) fn choose(view: &View, rays: &BTreeMap<u32, u64>, any: bool) -> Vec<(
     let mut seats = Seats::new(view);
     let mut later = Vec::new();
     for &(split, rays) in &splits {
-        if !seats.seat(split, &mut BTreeSet::new()) {
+        let mut tried = BTreeSet::new();
+        if !seats.seat(split, &mut tried) {
+            // from where nobody could be moved, nobody ever will be: all their own nodes are among these
+            tried.into_iter().for_each(|n| seats.stuck[n as usize] = true);
             later.push((split, rays));
         }
     }
     for (split, rays) in later {
-        if 2 * rays < most && !(any && seats.taken.is_empty()) {
+        if seats.left == 0 || (2 * rays < most && !(any && seats.taken.is_empty())) {
             break;
         }
         let disks = seats.live_holders(split);
@@ -88,7 +91,7 @@ pub(super) fn choose(view: &View, rays: &BTreeMap<u32, u64>, any: bool) -> Vec<(
             seats.take(split, node);
         }
     }
-    seats.taken
+    seats.taken.into_values().collect()
 }
 
 /// Slots that are free, and who gets them.
@@ -97,18 +100,35 @@ struct Seats<'v, 'a> {
     free: Vec<u32>,
     /// Memory that no warm split takes: a split that finds room there stays warm, and nothing is evicted for it.
     room: Vec<i128>,
-    taken: Vec<(u32, u32)>,
+    /// All free slots.
+    left: u64,
+    /// By split: live nodes where it is warm.
+    warm: Vec<Vec<u32>>,
+    /// Split and node, in the order in which they were taken.
+    taken: BTreeMap<u64, (u32, u32)>,
+    /// By node: what of those has its slots, by place in that order.
+    on: Vec<Vec<(u64, u32)>>,
+    /// By node: whether nobody there can ever be moved.
+    stuck: Vec<bool>,
 }
 
 impl<'v, 'a> Seats<'v, 'a> {
     fn new(view: &'v View<'a>) -> Self {
         let bytes = |s: &u32| i128::from(view.splits[*s as usize].bytes);
         let room = |n: &super::NodeView| i128::from(n.memory) - n.warm.iter().map(bytes).sum::<i128>();
+        let mut warm = vec![Vec::new(); view.splits.len()];
+        for (n, node) in (0u32..).zip(view.nodes).filter(|(_, node)| node.slots > 0) {
+            node.warm.iter().for_each(|&s| warm[s as usize].push(n));
+        }
         Seats {
             view,
             free: view.nodes.iter().map(|n| n.free).collect(),
             room: view.nodes.iter().map(room).collect(),
-            taken: Vec::new(),
+            left: view.nodes.iter().map(|n| u64::from(n.free)).sum(),
+            warm,
+            taken: BTreeMap::new(),
+            on: vec![Vec::new(); view.nodes.len()],
+            stuck: vec![false; view.nodes.len()],
         }
     }
 
@@ -120,25 +140,27 @@ impl<'v, 'a> Seats<'v, 'a> {
 
     /// The nodes where a split belongs, and whether it is warm there.
     fn own(&self, split: u32) -> (Vec<u32>, bool) {
-        let warm = |&n: &u32| {
-            let node = &self.view.nodes[n as usize];
-            node.slots > 0 && node.warm.contains(&split)
-        };
-        let warm: Vec<u32> = (0..self.free.len() as u32).filter(warm).collect();
-        if warm.is_empty() { (self.live_holders(split), false) } else { (warm, true) }
+        let warm = &self.warm[split as usize];
+        if warm.is_empty() { (self.live_holders(split), false) } else { (warm.clone(), true) }
     }
 
     fn take(&mut self, split: u32, node: u32) {
         self.free[node as usize] -= 1;
+        self.left -= 1;
         if !self.view.nodes[node as usize].warm.contains(&split) {
             self.room[node as usize] -= i128::from(self.view.splits[split as usize].bytes);
         }
-        self.taken.push((split, node));
+        let place = self.taken.last_key_value().map_or(0, |(last, _)| last + 1);
+        self.taken.insert(place, (split, node));
+        self.on[node as usize].push((place, split));
     }
 
-    fn leave(&mut self, split: u32, node: u32) {
-        self.taken.retain(|&t| t != (split, node));
+    /// Gives back the slot that was taken at this place in the order.
+    fn leave(&mut self, place: u64) {
+        let Some((split, node)) = self.taken.remove(&place) else { return };
+        self.on[node as usize].retain(|&(other, _)| other != place);
         self.free[node as usize] += 1;
+        self.left += 1;
         if !self.view.nodes[node as usize].warm.contains(&split) {
             self.room[node as usize] += i128::from(self.view.splits[split as usize].bytes);
         }
@@ -155,15 +177,14 @@ impl<'v, 'a> Seats<'v, 'a> {
             return true;
         }
         for node in own {
-            if !tried.insert(node) {
+            if self.stuck[node as usize] || !tried.insert(node) {
                 continue;
             }
             // those with fewest rays came last, and move first
-            for at in (0..self.taken.len()).rev().filter(|&at| self.taken[at].1 == node).collect::<Vec<_>>() {
-                let (other, _) = self.taken[at];
+            for (place, other) in self.on[node as usize].clone().into_iter().rev() {
                 if self.seat(other, tried) {
                     // it has two slots now: the old one is free
-                    self.leave(other, node);
+                    self.leave(place);
                     self.take(split, node);
                     return true;
                 }

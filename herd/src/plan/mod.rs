@@ -10,6 +10,7 @@ pub mod cut;
 mod grid;
 mod moving;
 pub mod place;
+mod queues;
 pub mod rate;
 #[cfg(test)]
 mod tests;

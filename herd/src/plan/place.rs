@@ -46,21 +46,29 @@ pub fn holders(sizes: &[u64], nodes: u32, replicas: u32) -> Vec<Vec<u32>> {
         .collect()
 }
 
-/// The window of at most `memory` bytes with most rays; of equals the first.
-pub fn fullest(sizes: &[u64], memory: u64, rays: impl Fn(u32) -> u64) -> Vec<u32> {
-    let mut best = (0u64, 0..0u32);
-    let (mut first, mut bytes, mut sum) = (0u32, 0u64, 0u64);
-    for end in 0..sizes.len() as u32 {
-        bytes += sizes[end as usize];
+/// The window of at most `memory` bytes with most rays, and how many; of equals the first; none without rays. `before`: bytes of all splits before each
+/// one, and of all; `with`: the splits that have rays, ascending.
+pub fn fullest(
+    before: &[u64],
+    memory: u64,
+    with: &[u32],
+    rays: impl Fn(u32) -> u64,
+) -> Option<(u64, std::ops::Range<u32>)> {
+    let mut best: Option<(u64, std::ops::Range<u32>)> = None;
+    // the window that ends at `end` begins at `first`; the first of those with rays in it is `with[inside]`
+    let (mut first, mut inside, mut sum) = (0u32, 0, 0u64);
+    for &end in with {
         sum += rays(end);
-        while bytes > memory {
-            bytes -= sizes[first as usize];
-            sum -= rays(first);
+        while before[end as usize + 1] - before[first as usize] > memory {
+            if with[inside] == first {
+                sum -= rays(first);
+                inside += 1;
+            }
             first += 1;
         }
-        if sum > best.0 {
-            best = (sum, first..end + 1);
+        if sum > best.as_ref().map_or(0, |b| b.0) {
+            best = Some((sum, first..end + 1));
         }
     }
-    best.1.collect()
+    best
 }

@@ -7,7 +7,7 @@ use proptest::prelude::*;
 use rayherd_api::Strategy as Way;
 
 use super::super::cost::{RAY, REMOTE};
-use super::super::{Assignment, Set, View, Waiting, Window, cut, free_slots, grid, plan};
+use super::super::{Assignment, NodeView, Set, View, Waiting, Window, cut, free_slots, grid, plan};
 use super::{Case, case};
 
 /// Whether all of these splits can have a slot on one of their own nodes at once: tried out.
@@ -367,5 +367,94 @@ proptest! {
         let least = candidates.iter().map(|c| naive_cost(&view, c)).fold(f64::INFINITY, f64::min);
         prop_assert_eq!(chosen.is_empty(), candidates.is_empty());
         prop_assert!(chosen.is_empty() || close(naive_cost(&view, &chosen), least));
+    }
+}
+
+/// What windows that move are worth to a node: rays of what no other holds, those of what lies on its disk twice.
+fn naive_windows(view: &View) -> Vec<Vec<u32>> {
+    let held = |n: &NodeView| if n.slots == 0 { vec![] } else { n.warm.iter().copied().collect::<Vec<u32>>() };
+    let mut windows: Vec<Vec<u32>> = view.nodes.iter().map(held).collect();
+    let rays = |s: u32| {
+        let waiting: u64 = view.waiting.get(&s).into_iter().flatten().map(|g| g.rays).sum();
+        waiting + view.camera.get(&s).copied().unwrap_or(0)
+    };
+    let count = view.splits.len() as u32;
+    for (n, node) in view.nodes.iter().enumerate().filter(|(_, node)| node.slots > 0 && node.free == node.slots) {
+        let near = |s: u32| view.splits[s as usize].holders.contains(&(n as u32));
+        let worth = |s: u32| rays(s) * if near(s) { 2 } else { 1 };
+        let elsewhere = |s: u32| windows.iter().enumerate().any(|(m, w)| m != n && w.contains(&s));
+        let free = |s: u32| if elsewhere(s) { 0 } else { worth(s) };
+        // of the windows that fit, the widest that ends at each place
+        let mut best: (u64, Vec<u32>) = (0, vec![]);
+        for end in 1..=count {
+            let mut sets = (0..end).map(|first| (first..end).collect::<Vec<u32>>());
+            let fits = |w: &Vec<u32>| w.iter().map(|&s| view.splits[s as usize].bytes).sum::<u64>() <= node.memory;
+            let Some(widest) = sets.find(fits) else { continue };
+            let there = widest.iter().map(|&s| free(s)).sum();
+            if there > best.0 {
+                best = (there, widest);
+            }
+        }
+        let own: u64 = windows[n].iter().map(|&s| worth(s)).sum();
+        if best.0 > 4 * own || (own == 0 && best.0 > 0) {
+            windows[n] = best.1;
+        }
+    }
+    windows
+}
+
+/// The plan of windows that move, by its rules.
+fn naive_moving(view: &View) -> Vec<Assignment> {
+    let windows = naive_windows(view);
+    let idle = view.nodes.iter().all(|n| n.free == n.slots);
+    let (mut waiting, mut camera) = (view.waiting.clone(), view.camera.clone());
+    let mut out = Vec::new();
+    for n in free_slots(view.nodes).into_iter().rev() {
+        let (window, node) = (&windows[n as usize], &view.nodes[n as usize]);
+        let stays = node.warm.iter().eq(window);
+        if window.is_empty() || (!stays && node.free < node.slots) {
+            continue;
+        }
+        let slots = u64::from(node.slots);
+        let mut there: Vec<Waiting> = window.iter().filter_map(|s| waiting.get(s)).flatten().copied().collect();
+        there.sort_by_key(|g| (Reverse(g.rays), g.id));
+        let waits: u64 = there.iter().map(|g| g.rays).sum();
+        let makes: u64 = window.iter().filter_map(|s| camera.get(s)).sum();
+        let set = Set::Resident(window.clone());
+        if waits > 0 && (waits >= view.least_rays || (makes == 0 && idle)) {
+            let wanted = waits.div_ceil(slots).max(view.least_rays).min(view.task_rays).max(1);
+            let (mut groups, mut sum) = (Vec::new(), 0);
+            for g in there {
+                if sum < wanted {
+                    sum += g.rays;
+                    groups.push(g.id);
+                }
+            }
+            waiting.values_mut().for_each(|q| q.retain(|g| !groups.contains(&g.id)));
+            out.push(Assignment { node: n, set, groups, camera: None });
+        } else if makes > 0 {
+            let wanted = makes.div_ceil(slots).min(view.task_camera).max(1);
+            let mut left = wanted;
+            for s in window {
+                if let Some(c) = camera.get_mut(s) {
+                    let made = left.min(*c);
+                    (*c, left) = (*c - made, left - made);
+                }
+            }
+            out.push(Assignment { node: n, set, groups: vec![], camera: Some((wanted, window.clone())) });
+        }
+    }
+    out
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(512))]
+
+    #[test]
+    fn windows_that_move_are_those_of_the_plain_twin(case in case()) {
+        let case = Case { strategy: Way::Auto, cut: vec![], ..case };
+        let view = case.view();
+        let expected = if view.nodes.iter().all(|n| n.free == 0) { vec![] } else { naive_moving(&view) };
+        prop_assert_eq!(plan(&view), expected);
     }
 }
