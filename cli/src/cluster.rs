@@ -1,7 +1,11 @@
 //! Jobs on a Kubernetes cluster, by the conventions of kubectl. Only this module knows Kubernetes.
 
+use std::collections::BTreeSet;
+use std::time::Duration;
+
 use anyhow::Context;
 use clap::Args;
+use futures::{AsyncBufReadExt, TryStreamExt};
 use k8s_openapi::api::core::v1::Pod;
 use k8s_openapi::jiff::Timestamp;
 use kube::api::{ApiResource, DynamicObject, ListParams, LogParams, Patch, PatchParams};
@@ -11,6 +15,8 @@ use rayherd_api::RenderJob;
 use rayherd_api::resource::{RenderJobObject, RenderJobStatus};
 use rustls::crypto::ring::default_provider;
 use tokio::runtime::Runtime;
+use tokio::sync::mpsc;
+use tokio::time::{Instant, timeout_at};
 
 use crate::fault::Mistake;
 
@@ -20,6 +26,10 @@ const MANAGER: &str = "rayherd";
 const LABEL: &str = "rayherd.io/job";
 /// The number of a worker.
 const NUMBER: &str = "rayherd.io/worker";
+/// Between two looks for workers whose log is not followed yet.
+const LOOK: Duration = Duration::from_secs(1);
+/// Lines of logs that wait to be printed.
+const WAITING: usize = 1024;
 
 /// Which cluster, and where in it.
 #[derive(Args)]
@@ -158,6 +168,59 @@ impl Cluster {
         self.runtime.block_on(read).map_err(|e: kube::Error| self.told(e, &format!("logs of renderjob {name}")))
     }
 
+    /// Hands on what a job's workers say while they say it: name of the pod and line. A worker that begins anew is followed anew; the end is
+    /// there when the job is done, or deleted, and no worker says anything any more, or when `hand_on` says that it wants no more.
+    ///
+    /// # Errors
+    /// When there is no such job, its pods' logs are refused, or the line cannot be handed on.
+    pub fn follow(
+        &self,
+        name: &str,
+        tail: Option<i64>,
+        mut hand_on: impl FnMut(&str, &str) -> anyhow::Result<bool>,
+    ) -> anyhow::Result<()> {
+        let what = format!("logs of renderjob {name}");
+        let pods: Api<Pod> = Api::namespaced(self.client.clone(), &self.namespace);
+        let (send, mut lines) = mpsc::channel::<(String, String)>(WAITING);
+        self.runtime.block_on(async {
+            let job = self.api().get(name).await.map_err(|e| self.told(e, &format!("renderjob {name}")))?;
+            let uid = job.metadata.uid.unwrap_or_default();
+            let label = format!("{LABEL}={uid}");
+            let mut begun = BTreeSet::new();
+            let mut streams = tokio::task::JoinSet::new();
+            loop {
+                // asked before the pods: what a job that is done has started is seen below
+                let job = self.api().get_opt(name).await.map_err(|e| self.told(e, &what))?;
+                let job = job.filter(|j| j.metadata.uid.as_deref() == Some(&uid));
+                let over = job.is_none_or(|j| matches!(shown(&j).phase.as_str(), "Complete" | "Failed"));
+                let found = pods.list(&ListParams::default().labels(&label)).await.map_err(|e| self.told(e, &what))?;
+                for pod in &found.items {
+                    let Some(container) = container_begun(pod).filter(|c| begun.insert(c.clone())) else { continue };
+                    tracing::debug!(pod = pod.name_any(), container, "following");
+                    let params = LogParams {
+                        follow: true,
+                        tail_lines: tail,
+                        container: Some("worker".into()),
+                        ..LogParams::default()
+                    };
+                    streams.spawn(pass_on(pods.clone(), pod.name_any(), params, send.clone()));
+                }
+                let end = Instant::now() + LOOK;
+                while let Ok(Some((pod, line))) = timeout_at(end, lines.recv()).await {
+                    if !hand_on(&pod, &line)? {
+                        return Ok(());
+                    }
+                }
+                while let Some(ended) = streams.try_join_next() {
+                    ended.context("a log's reader panicked")?.map_err(|e| self.told(e, &what))?;
+                }
+                if over && streams.is_empty() && lines.is_empty() {
+                    return Ok(());
+                }
+            }
+        })
+    }
+
     /// What the user can put right is told as that.
     fn told(&self, error: kube::Error, what: &str) -> anyhow::Error {
         match error {
@@ -169,6 +232,45 @@ impl Cluster {
                 Mistake(format!("{what}: {} (namespace {})", e.message, self.namespace)).into()
             }
             e => anyhow::Error::new(e).context(format!("{what}: the API server does not do it")),
+        }
+    }
+}
+
+/// The container of a worker that runs, or has run, by its id: another one after each start.
+fn container_begun(pod: &Pod) -> Option<String> {
+    let all = pod.status.as_ref()?.container_statuses.as_ref()?;
+    let worker = all.iter().find(|c| c.name == "worker")?;
+    let state = worker.state.as_ref()?;
+    (state.running.is_some() || state.terminated.is_some()).then(|| worker.container_id.clone()).flatten()
+}
+
+/// Reads a log to its end, which comes with that of the container.
+async fn pass_on(
+    pods: Api<Pod>,
+    pod: String,
+    params: LogParams,
+    to: mpsc::Sender<(String, String)>,
+) -> kube::Result<()> {
+    let stream = match pods.log_stream(&pod, &params).await {
+        Ok(stream) => stream,
+        // deleted meanwhile, with its log
+        Err(kube::Error::Api(e)) if matches!(e.code, 400 | 404) => return Ok(()),
+        Err(e) => return Err(e),
+    };
+    let mut lines = std::pin::pin!(stream.lines());
+    loop {
+        match lines.try_next().await {
+            Ok(Some(line)) => {
+                if to.send((pod.clone(), line)).await.is_err() {
+                    return Ok(());
+                }
+            }
+            Ok(None) => return Ok(()),
+            // its node went away
+            Err(e) => {
+                tracing::warn!("{pod}: its log breaks off: {e}");
+                return Ok(());
+            }
         }
     }
 }
@@ -230,5 +332,24 @@ mod tests {
         let changed = shown(&job(1));
         assert_eq!((changed.phase.as_str(), changed.why), ("Pending", None));
         assert_eq!([5, 119, 120, 7199, 7200, 200_000].map(short), ["5s", "119s", "2m", "119m", "2h", "2d"]);
+    }
+
+    #[test]
+    fn a_container_is_followed_when_it_has_begun_and_anew_when_it_begins_anew() {
+        let pod = |state: serde_json::Value, id: &str| -> Pod {
+            let status = serde_json::json!({"name": "worker", "state": state, "containerID": id, "image": "", "imageID": "",
+                "ready": true, "restartCount": 0});
+            let beside = serde_json::json!({"name": "beside", "state": {"running": {}}, "containerID": "b", "image": "",
+                "imageID": "", "ready": true, "restartCount": 0});
+            serde_json::from_value(
+                serde_json::json!({"metadata": {}, "status": {"containerStatuses": [beside, status]}}),
+            )
+            .unwrap()
+        };
+        assert_eq!(container_begun(&pod(serde_json::json!({"waiting": {}}), "")), None);
+        assert_eq!(container_begun(&Pod::default()), None);
+        assert_eq!(container_begun(&pod(serde_json::json!({"running": {}}), "a")).as_deref(), Some("a"));
+        let ended = serde_json::json!({"terminated": {"exitCode": 1}});
+        assert_eq!(container_begun(&pod(ended, "c")).as_deref(), Some("c"));
     }
 }

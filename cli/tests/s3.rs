@@ -107,7 +107,8 @@ fn a_bucket_serves_as_a_folder_does() {
     let server = Server::start();
     let store = format!("s3://{BUCKET}/scenes/one");
     let worse = |bad: bool| {
-        let some = S3Faults { seed: 5, unavailable: 40, lost_reply: 20, cut_body: 20, latency: Duration::ZERO };
+        let some =
+            S3Faults { seed: 5, unavailable: 40, starting: 20, lost_reply: 20, cut_body: 20, latency: Duration::ZERO };
         server.server.set_faults(if bad { some } else { S3Faults::default() });
     };
     serves_as_a_folder_does(&store, &|folder, arguments| server.run(folder, arguments), &worse);

@@ -275,6 +275,19 @@ impl Fleet {
     /// # Errors
     /// When it cannot be done.
     pub fn call(&self, work: Work) -> Result<Done, JobError> {
+        let done = self.ask(work, false)?;
+        done.ok_or_else(|| JobError::Internal("work was given up that was to be waited for".into()))
+    }
+
+    /// As [`Fleet::call`], as long as a worker is there: none when all are gone, and nobody does it.
+    ///
+    /// # Errors
+    /// When it cannot be done.
+    pub fn call_while_staffed(&self, work: Work) -> Result<Option<Done>, JobError> {
+        self.ask(work, true)
+    }
+
+    fn ask(&self, work: Work, while_staffed: bool) -> Result<Option<Done>, JobError> {
         let mut state = self.lock();
         let call = state.next;
         state.next += 1;
@@ -282,7 +295,7 @@ impl Fleet {
         self.wanted.notify_waiters();
         loop {
             if let Some(result) = state.answers.remove(&call) {
-                return result.map_err(|f| match f {
+                return result.map(Some).map_err(|f| match f {
                     Failure::Lost { name, why } => JobError::Lost { name, why },
                     Failure::Stopped => JobError::Stopped,
                     Failure::ForNow { message } | Failure::ForGood { message } => JobError::Settings(message),
@@ -291,6 +304,27 @@ impl Fleet {
             state.check()?;
             if state.sweep() {
                 self.wanted.notify_waiters();
+            }
+            if while_staffed && !state.is_staffed() {
+                // what a worker had in hand that is gone is back among the common work
+                state.common.retain(|(c, _)| *c != call);
+                return Ok(None);
+            }
+            state = self.wait(state, Duration::from_millis(200));
+        }
+    }
+
+    /// Waits until a worker is there.
+    ///
+    /// # Errors
+    /// When the job was cancelled meanwhile.
+    pub fn staffed(&self) -> Result<(), JobError> {
+        let mut state = self.lock();
+        loop {
+            state.check()?;
+            state.sweep();
+            if state.is_staffed() {
+                return Ok(());
             }
             state = self.wait(state, Duration::from_millis(200));
         }
@@ -371,6 +405,10 @@ impl State {
             self.leave(number);
         }
         !gone.is_empty()
+    }
+
+    fn is_staffed(&self) -> bool {
+        self.workers.iter().any(Option::is_some)
     }
 
     /// Counts a failure that may pass by itself; whether that is still to be hoped for.

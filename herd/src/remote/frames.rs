@@ -117,11 +117,16 @@ pub fn run(job: &Job, keeper: &Arc<dyn Keeper>, progress: &dyn Progress) -> Resu
 /// Has the scene prepared by a worker, unless it is; its manifest, and whether it was there.
 fn prepared(job: &Job, replicas: u32) -> Result<(ObjectRef, bool), JobError> {
     let prepare = Work::Prepare { spec: Box::new(job.spec.clone()), replicas };
-    // of two jobs that come at once with one scene, the second finds it prepared
-    let _turn = job.turns.take(&job.spec.scene.source, || job.fleet.check())?;
-    match job.fleet.call(prepare)? {
-        Done::Prepared { scene, reused } => Ok((scene, reused)),
-        _ => Err(JobError::Internal("a worker reports something else than it was to do".into())),
+    loop {
+        // whose turn it is must have who does it: jobs that wait with their workers may leave no room for its own
+        job.fleet.staffed()?;
+        // of two jobs that come at once with one scene, the second finds it prepared
+        let _turn = job.turns.take(&job.spec.scene.source, || job.fleet.check())?;
+        match job.fleet.call_while_staffed(prepare.clone())? {
+            Some(Done::Prepared { scene, reused }) => return Ok((scene, reused)),
+            Some(_) => return Err(JobError::Internal("a worker reports something else than it was to do".into())),
+            None => tracing::warn!("the worker that was to prepare the scene is gone: others come first"),
+        }
     }
 }
 

@@ -278,6 +278,29 @@ fn a_scene_is_prepared_once_and_a_finished_job_is_not_done_again() {
     assert!(!prepared[0].1 && prepared[1].1, "{prepared:?}");
 }
 
+/// Pods of jobs that wait may take the room of the pod of the job that they wait for.
+#[test]
+fn a_job_without_workers_keeps_no_other_from_preparing_their_scene() {
+    let spec = spec(Strategy::Auto, 2, 1);
+    let (cluster, kept) = (Cluster::new(2), Arc::new(Kept::default()));
+    let (first, depot) = (Fleet::new(3, "f"), cluster.depot(None));
+    let (first, cluster, spec) = (&first, &cluster, &spec);
+    std::thread::scope(|scope| {
+        let keeper: Arc<dyn Keeper> = Arc::new(Kept::default());
+        let depot = &depot;
+        let waits = scope.spawn(move || run(&cluster.job(spec, depot, first, "f"), &keeper, &Silent));
+        // nor one whose worker was there, and is gone with the work in its hands
+        let gone = WorkerId { number: 0, session: "gone".into() };
+        let poll = Poll { worker: gone.clone(), home: None, stage: None, clerk: false };
+        wait_for(|| matches!(first.answer(&poll), Ok(Answer::Work { .. })));
+        first.gone(&gone);
+        cluster.render(spec, &kept).unwrap();
+        first.cancel("enough");
+        assert!(matches!(waits.join().unwrap(), Err(JobError::Owned(_))));
+    });
+    assert!(cluster.picture(0) == expected(spec));
+}
+
 #[test]
 fn workers_and_operators_that_go_change_no_byte() {
     let spec = spec(Strategy::SchedulingGridOverlapReduced, 4, 2);

@@ -233,6 +233,11 @@ impl S3Store {
             // RequestTimeout comes with 400
             ("SlowDown" | "RequestTimeout" | "InternalError" | "ServiceUnavailable" | "OperationAborted", _)
             | (_, 408 | 429 | 500..=599) => StoreError::Unavailable { store, action, key, message },
+            // whoever denies something says what; MinIO of 2021 answers so while it starts, before it knows its users
+            ("", 403) => {
+                let message = format!("{message}, without a reason: the server may still be starting");
+                StoreError::Unavailable { store, action, key, message }
+            }
             _ => StoreError::Denied { store, action, key, message },
         }
     }
@@ -310,15 +315,32 @@ impl BlockStore for S3Store {
 
     async fn size(&self, key: &str) -> Result<Option<u64>, StoreError> {
         check_key(key)?;
+        let length = |length: Option<i64>| match length.map(u64::try_from) {
+            Some(Ok(length)) => Ok(Some(length)),
+            _ => Err(self.broken("size", key, "the answer does not say how long it is")),
+        };
         let request = self.client.head_object().bucket(&self.bucket).key(self.path(key)).send();
-        match request.await {
-            Ok(head) => match head.content_length().map(u64::try_from) {
-                Some(Ok(length)) => Ok(Some(length)),
-                _ => Err(self.broken("size", key, "the answer does not say how long it is")),
+        // HEAD's answers have no body, hence no code
+        let (error, status) = match request.await {
+            Ok(head) => return length(head.content_length()),
+            Err(SdkError::ServiceError(e)) => {
+                let status = e.raw().status().as_u16();
+                (SdkError::ServiceError(e), status)
+            }
+            Err(e) => (e, 0),
+        };
+        match status {
+            // the bucket was there in `connect`
+            404 => Ok(None),
+            // a GET is refused for the same reasons, and says which; its body is not read
+            403 => match self.client.get_object().bucket(&self.bucket).key(self.path(key)).send().await {
+                Ok(got) => length(got.content_length()),
+                Err(e) => match self.failure("size", key, 0, e) {
+                    StoreError::NotFound { .. } => Ok(None),
+                    why => Err(why),
+                },
             },
-            // HEAD's answers have no body, hence no code: the bucket was there in `connect`
-            Err(SdkError::ServiceError(e)) if e.raw().status().as_u16() == 404 => Ok(None),
-            Err(e) => Err(self.failure("size", key, 0, e)),
+            _ => Err(self.failure("size", key, 0, error)),
         }
     }
 

@@ -32,6 +32,8 @@ pub struct S3Faults {
     pub seed: u64,
     /// Answered with 503 SlowDown and not done.
     pub unavailable: u32,
+    /// Answered with 403 and nothing else and not done, as MinIO of 2021 does while it starts.
+    pub starting: u32,
     /// Done, but the connection ends before the answer.
     pub lost_reply: u32,
     /// GET: the connection ends in the middle of the body.
@@ -112,6 +114,7 @@ impl Drop for S3Server {
 enum Fate {
     Served,
     Unavailable,
+    Starting,
     LostReply,
     CutBody,
 }
@@ -123,8 +126,12 @@ impl State {
         let hash = blake3::hash(&[faults.seed.to_le_bytes(), number.to_le_bytes()].concat());
         let mut draw = u32::from_le_bytes(std::array::from_fn(|i| hash.as_bytes()[i])) % 1000;
         let cut_body = if reads { faults.cut_body } else { 0 };
-        let shares =
-            [(Fate::Unavailable, faults.unavailable), (Fate::LostReply, faults.lost_reply), (Fate::CutBody, cut_body)];
+        let shares = [
+            (Fate::Unavailable, faults.unavailable),
+            (Fate::Starting, faults.starting),
+            (Fate::LostReply, faults.lost_reply),
+            (Fate::CutBody, cut_body),
+        ];
         for (fate, share) in shares {
             if draw < share {
                 self.injected.fetch_add(1, Ordering::Relaxed);
@@ -157,6 +164,10 @@ async fn answer(service: S3Service, state: Arc<State>, request: Request<Incoming
     if fate == Fate::Unavailable {
         let body = "<Error><Code>SlowDown</Code><Message>on purpose</Message></Error>".to_owned();
         let response = hyper::Response::builder().status(503).body(Body::from(body));
+        return response.map_err(|e| HttpError::new(Box::new(e)));
+    }
+    if fate == Fate::Starting {
+        let response = hyper::Response::builder().status(403).body(Body::empty());
         return response.map_err(|e| HttpError::new(Box::new(e)));
     }
     let response = service.call(request.map(Body::from)).await?;

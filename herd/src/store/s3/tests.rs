@@ -22,7 +22,7 @@ async fn conforms_over_a_bad_network() {
     let server = S3Server::start().await;
     let store = S3Store::connect(server.settings("p")).await.unwrap();
     let latency = Duration::from_micros(200);
-    server.set_faults(S3Faults { seed: 11, unavailable: 60, lost_reply: 40, cut_body: 60, latency });
+    server.set_faults(S3Faults { seed: 11, unavailable: 60, starting: 40, lost_reply: 40, cut_body: 60, latency });
     let store = Retrying::new(Arc::new(store), soon());
     conformance(&store).await;
     let (requests, injected) = server.requests();
@@ -65,6 +65,48 @@ async fn what_goes_wrong_is_named_by_what_can_be_done() {
     let error = S3Store::connect(settings).await.unwrap_err();
     assert!(matches!(&error, StoreError::Unavailable { .. }), "{error:?}");
     assert!(error.to_string().contains("refused"), "{error}");
+}
+
+/// MinIO of 2021 answers with a bare 403 while it starts, also what a HEAD is answered with when it is denied.
+#[tokio::test]
+async fn a_refusal_without_a_reason_passes_one_with_a_reason_does_not() {
+    let server = S3Server::start().await;
+    let settings = server.settings("p");
+    let store = S3Store::connect(settings.clone()).await.unwrap();
+    store.put("k", Bytes::from_static(b"a body")).await.unwrap();
+    server.set_faults(S3Faults { starting: 1000, ..S3Faults::default() });
+    let keys = ["k".to_owned()];
+    let refused = [
+        store.put("k", Bytes::new()).await.err(),
+        store.get("k").await.err(),
+        store.size("k").await.err(),
+        store.list("").await.err(),
+        store.delete(&keys).await.err(),
+        S3Store::connect(settings.clone()).await.err(),
+    ];
+    for error in refused {
+        let error = error.unwrap();
+        assert!(matches!(&error, StoreError::Unavailable { .. }), "{error:?}");
+        assert!(error.to_string().contains("HTTP 403, without a reason: the server may still be starting"), "{error}");
+    }
+    // one that comes up meanwhile
+    server.set_faults(S3Faults { seed: 3, starting: 500, ..S3Faults::default() });
+    let patient = Retrying::new(Arc::new(store.clone()), soon());
+    for _ in 0..20 {
+        assert_eq!(patient.size("k").await.unwrap(), Some(6));
+    }
+    assert!(patient.retries() > 0);
+    server.set_faults(S3Faults::default());
+    assert_eq!(store.get("k").await.unwrap(), "a body");
+
+    let mut wrong = settings;
+    wrong.credentials.secret_key = "wrong".to_owned();
+    let store = S3Store::new(wrong).unwrap();
+    for error in [store.size("k").await.err(), store.put("k", Bytes::new()).await.err()] {
+        let error = error.unwrap();
+        assert!(matches!(&error, StoreError::Denied { .. }), "{error:?}");
+        assert!(error.to_string().contains("SignatureDoesNotMatch"), "{error}");
+    }
 }
 
 /// The TLS client is there and its crypto provider chosen: without one, rustls panics at the first connection.
