@@ -11,7 +11,7 @@ import sys
 import tempfile
 
 ONE_SPLIT_A_TASK = ["--splits", "32", "--nodes", "8", "--slots", "1", "--strategy", "scheduling-grid-overlap-reduced"]
-CHEST = ["CHEST", "--iso", "-789.5", "--size", "256x256", "--spp", "4"]
+CHEST = ["CHEST", "--iso", "-789.5", "--size", "128x128", "--spp", "1"]
 CORNELL = ["CORNELL", "--size", "256x256", "--spp", "16"]
 STAIRCASE = ["STAIRCASE", "--size", "256x256", "--spp", "4"]
 
@@ -20,7 +20,7 @@ ROWS = [
     ("cells", CHEST + ONE_SPLIT_A_TASK, ["hops", "trace:write:rays"]),
     ("beaten", CHEST + ONE_SPLIT_A_TASK, ["hops", "trace:write:rays"]),
     ("splits", CHEST + ONE_SPLIT_A_TASK, ["trace:read:geometry"]),
-    ("attributes", CHEST + ONE_SPLIT_A_TASK, ["trace:read:attributes"]),
+    ("attributes", CHEST + ONE_SPLIT_A_TASK + ["--memory", "32Mi"], ["trace:read:attributes"]),
     ("film", CHEST + ONE_SPLIT_A_TASK, ["trace:write:film"]),
     ("volume", CHEST, ["cpu_s"]),
     ("prepared", CHEST + ["--store", "STORE", "--resume"], ["prepare:read:source", "prepare:write:geometry", "cpu_s"]),

@@ -220,7 +220,7 @@ fn a_million_lamps() {
     let kinds = 64;
     for k in 0..kinds {
         let emission = Some([libm::expf(8.0 * signed(&mut random)); 3]);
-        world.shapes.push(ShapeInfo { name: k.to_string(), material: 0, emission });
+        world.shapes.push(ShapeInfo { name: k.to_string(), material: 0, emission, emission_texture: None });
     }
     // all above the points that are lit, with their fronts down
     let side = 0.2 / f64::from(n).sqrt();

@@ -27,6 +27,7 @@ pub fn shape(triangles: &[Wide], material: u32, emission: Option<[f32; 3]>) -> S
         to_world: Affine::IDENTITY,
         material,
         emission,
+        emission_texture: None,
         flip_normals: false,
         face_normals: false,
     }

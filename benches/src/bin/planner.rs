@@ -120,17 +120,17 @@ impl Simulation {
     }
 
     fn run(mut self, settings: &Settings, end: usize) -> anyhow::Result<()> {
-        let start = thread_cpu()?;
+        let start = thread_cpu();
         if self.strategy == Strategy::Auto {
             self.cut = cut::choose(&self.view());
         }
-        let choosing = thread_cpu()? - start;
+        let choosing = thread_cpu() - start;
         let (mut times, mut tasks) = (Vec::new(), 0);
         while times.len() < settings.rounds {
             let view = self.view();
-            let start = thread_cpu()?;
+            let start = thread_cpu();
             let planned = plan(&view);
-            times.push(thread_cpu()? - start);
+            times.push(thread_cpu() - start);
             if planned.is_empty() && self.running.is_empty() {
                 break;
             }

@@ -259,8 +259,8 @@ pub fn floor(lamp: &Lamp) -> Description {
     Description { shapes, materials: vec![half, black], environment, ..cornell() }
 }
 
-/// The box with 60 small lamps, half of them on its left wall, half in its middle with their backs to the right; a mirror and a glass ball, no
-/// sky.
+/// The box with 60 small lamps, half of them on its left wall, half in its middle that shine to the left and to the right in turn; a
+/// mirror and a glass ball, no sky.
 pub fn lamps() -> Description {
     let mut out = Description { environment: None, ..cornell() };
     out.shapes.retain(|s| s.emission.is_none());
@@ -275,11 +275,13 @@ pub fn lamps() -> Description {
     for i in 0..30 {
         let (y, z) = (-0.9 + 0.3 * f64::from(i % 6), -0.8 + 0.3 * f64::from(i / 6));
         let light = Some([20.0 + f64::from(i) as f32, 25.0, 30.0]);
-        // fronts to the right and to the left: what is right of the middle sees half of them
+        // neighbours in the middle have their backs to each other's side
         let left = sheet([-0.98, y, z], [0.0, s, 0.0], [0.0, 0.0, s], 1);
-        let right = sheet([0.2, y, z], [0.0, 0.0, s], [0.0, s, 0.0], 1);
+        let (u, v) = ([0.0, 0.0, s], [0.0, s, 0.0]);
+        let (u, v) = if i % 2 == 0 { (u, v) } else { (v, u) };
+        let middle = sheet([0.2, y, z], u, v, 1);
         out.shapes.push(shape(&format!("left lamp {i}"), left, 0, light));
-        out.shapes.push(shape(&format!("right lamp {i}"), right, 0, light));
+        out.shapes.push(shape(&format!("middle lamp {i}"), middle, 0, light));
     }
     out
 }

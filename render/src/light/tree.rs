@@ -64,8 +64,6 @@ pub(crate) struct Node {
     sin_normals: [f32; WIDTH],
     /// At or below this cosine, of the angle from the nearest normal, it is dark.
     dark: [f32; WIDTH],
-    /// What is dark counts for: 0, by which it is left out.
-    of_dark: [f32; WIDTH],
     /// Sum of the largest intensities; the whole tree's is 1.
     intensity: [f32; WIDTH],
     /// Sources below; 0 where there is no child.
@@ -117,10 +115,10 @@ impl Tree {
         self.share
     }
 
-    /// Leaves nothing out that is dark at a point: it is chosen as little as may be.
+    /// Leaves nothing out that is dark at a point: it counts as if it shone there at grazing angles.
     pub(super) fn leave_out_none(&mut self) {
         for node in &mut self.nodes {
-            node.of_dark = node.count.map(|n| if n > 0 { f32::MIN_POSITIVE } else { 0.0 });
+            node.dark = node.count.map(|n| if n > 0 { f32::NEG_INFINITY } else { f32::INFINITY });
         }
     }
 
@@ -188,7 +186,6 @@ impl Node {
             cos_normals: zero,
             sin_normals: zero,
             dark: infinite,
-            of_dark: zero,
             intensity: zero,
             count: [0; WIDTH],
             child: [0; WIDTH],
@@ -227,7 +224,7 @@ impl Node {
         (self.count[k] == 1).then_some(self.child[k] ^ LEAF)
     }
 
-    /// What may arrive at `o` from child `k` on a surface that faces it, roughly; 0 only if nothing does (or what dark children count for), or there is no child.
+    /// What may arrive at `o` from child `k` on a surface that faces it, roughly; 0 only if nothing does, or there is no child.
     #[inline(always)]
     pub(crate) fn importance(&self, k: usize, o: Vec3) -> f32 {
         let [x, y, z] = [o.x - self.center[0][k], o.y - self.center[1][k], o.z - self.center[2][k]];
@@ -251,7 +248,7 @@ impl Node {
         // NaN too becomes a number: a point that is none chooses something
         let importance = if importance > f32::MIN_POSITIVE { importance } else { f32::MIN_POSITIVE };
         let importance = if importance < LARGEST { importance } else { LARGEST };
-        if cos <= self.dark[k] { self.of_dark[k] } else { importance }
+        if cos <= self.dark[k] { 0.0 } else { importance }
     }
 
     /// Where the children's intervals of [0, `length`) end, and how many sources there are below those that shine at `o`; without any the ends
