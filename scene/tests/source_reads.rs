@@ -12,8 +12,9 @@ use rayherd_scene::import::{DescriptionSource, ImportOptions, StreamOptions, imp
 use rayherd_scene::objects::MemoryObjects;
 use rayherd_scene::prepare::{ByteKind, ByteOp, PrepareProgress, PrepareSettings, SpoolSettings, Stage, prepare};
 
-/// What tells the format of a file: read before it is known who reads the rest. Of a volume it is looked at twice.
-const HEAD: u64 = 256 + 132;
+/// What tells the format of a file, and what materials or colours a mesh has: read before it is known who reads the rest. Of a volume it is
+/// looked at twice.
+const HEAD: u64 = 256 + 132 + 4096;
 /// Vertices along a side of the grid that every mesh here is.
 const N: usize = 80;
 

@@ -44,7 +44,7 @@ fn cases() -> Vec<Case> {
     let mut out = Vec::new();
     for (name, description, size, spp) in [
         ("cornell", testing::cornell(), [40, 24], 3),
-        ("textured", textured, [4, 3], 1),
+        ("textured", textured, [2, 1], 1),
         ("lamps", testing::lamps(), [36, 12], 3),
         ("scan", testing::scan(), [36, 12], 3),
     ] {

@@ -62,9 +62,8 @@ pub(super) fn meshes(
                 let (names, bytes) = super::obj::libraries(path)?;
                 out.bytes_read += bytes;
                 let mut libraries = Libraries { options, out: &mut out, unsupported: vec![] };
-                if let Some((found, materials)) = libraries.read(path, &names)? {
-                    (parts, made) = (Some(found), materials);
-                }
+                let found = libraries.read(path, &names)?;
+                (parts, made) = (Some(found.0), found.1);
                 unsupported.append(&mut libraries.unsupported);
             }
             MeshFormat::Ply if looks => {

@@ -56,16 +56,16 @@ pub(super) struct Face {
 /// A `mtllib` statement: what it says, and the line.
 pub(super) type LibraryNames = Vec<(String, u32)>;
 
-/// The `mtllib` statements before a file's first face or `usemtl`; and the bytes read to find them.
+/// The `mtllib` statements before a file's first vertex, face or `usemtl`; and the bytes read to find them.
 pub(super) fn libraries(path: &Path) -> Result<(LibraryNames, u64), ImportError> {
-    let mut reader = ObjReader::open(path, &StreamOptions::default(), None)?;
+    let mut reader = ObjReader::new(Source::open_head(path)?, &StreamOptions::default(), None);
     let mut out = vec![];
     while reader.read_line()? {
         let line = reader.line.trim_ascii_start();
         let (keyword, rest) = line.split_at(line.iter().position(u8::is_ascii_whitespace).unwrap_or(line.len()));
         match keyword {
             b"mtllib" => out.push((name_of(rest), reader.source.place().1)),
-            b"f" | b"usemtl" => break,
+            b"v" | b"vn" | b"vt" | b"f" | b"usemtl" => break,
             _ => {}
         }
     }
@@ -80,12 +80,16 @@ fn name_of(text: &[u8]) -> String {
 impl ObjReader {
     /// Opens a file whose materials are these parts.
     pub fn open(path: &Path, options: &StreamOptions, parts: Option<&Parts>) -> Result<Self, ImportError> {
+        Ok(ObjReader::new(Source::open(path)?, options, parts))
+    }
+
+    fn new(source: Source, options: &StreamOptions, parts: Option<&Parts>) -> Self {
         let numbers = |parts: &Parts| PartNumbers {
             by_name: (1u32..).zip(&parts.names).map(|(n, name)| (name.clone().into_bytes(), n)).collect(),
             parts: parts.clone(),
         };
-        Ok(ObjReader {
-            source: Source::open(path)?,
+        ObjReader {
+            source,
             budget: budget(options),
             positions: Positions::Double(Column::new()),
             uv: Column::new(),
@@ -96,7 +100,7 @@ impl ObjReader {
             recognized: false,
             parts: parts.map(numbers),
             part: 0,
-        })
+        }
     }
 
     /// The part of what follows.
@@ -105,7 +109,7 @@ impl ObjReader {
         let name = name_of(rest);
         self.part = match parts.by_name.get(name.as_bytes()) {
             Some(&part) => part,
-            None if parts.parts.lenient => 0,
+            None if parts.parts.lenient || parts.parts.libraries.is_empty() => 0,
             None => {
                 return self.source.fail_line(format!(
                     "usemtl \"{name}\", which no mtllib of this file defines: add it there, or pass --albedo to use no materials"
@@ -120,7 +124,7 @@ impl ObjReader {
         let name = name_of(rest);
         match &self.parts {
             Some(parts) if !parts.parts.lenient && !parts.parts.libraries.contains(&name) => self.source.fail_line(
-                format!("mtllib \"{name}\" stands after the first face or usemtl: move it to the top of the file"),
+                format!("mtllib \"{name}\" stands after the first vertex, face or usemtl: move it to the top of the file, or pass --albedo to use no materials"),
             ),
             _ => Ok(()),
         }

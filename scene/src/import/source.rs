@@ -13,6 +13,8 @@ use crate::description::Place;
 
 /// Bytes in memory; also the longest line.
 const BUFFER: usize = 256 << 10;
+/// The same where only the first lines are wanted.
+const HEAD: usize = 4 << 10;
 /// Longest word of a text format.
 const MAX_TOKEN: usize = 256;
 /// DEFLATE never makes more than this many bytes of one (RFC 1951: a 258-byte match takes at least 2 bits).
@@ -30,6 +32,8 @@ pub(super) struct Source {
     /// Line of the last word or line read, from 1.
     line: u32,
     file_length: u64,
+    /// Bytes read at a time.
+    chunk: usize,
 }
 
 enum Input {
@@ -68,7 +72,22 @@ impl Source {
                 (Input::Plain(file), first.len())
             }
         };
-        Ok(Source { path: path.into(), input, buffer, start: 0, end, offset: 0, line: 0, file_length: metadata.len() })
+        Ok(Source {
+            path: path.into(),
+            input,
+            buffer,
+            start: 0,
+            end,
+            offset: 0,
+            line: 0,
+            file_length: metadata.len(),
+            chunk: BUFFER,
+        })
+    }
+
+    /// Opens a regular file of which only the first lines are wanted.
+    pub fn open_head(path: &Path) -> Result<Source, ImportError> {
+        Ok(Source { chunk: HEAD, ..Source::open(path)? })
     }
 
     /// Bytes read from disk, packed ones for gzip.
@@ -155,7 +174,8 @@ impl Source {
         self.end -= self.start;
         self.start = 0;
         while self.end < n {
-            let room = &mut self.buffer[self.end..];
+            let most = self.buffer.len().min(self.end.saturating_add(self.chunk));
+            let room = &mut self.buffer[self.end..most];
             let result = match &mut self.input {
                 Input::Plain(file) => file.read(room),
                 Input::Gzip(decoder) => decoder.read(room),

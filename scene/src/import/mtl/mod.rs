@@ -49,11 +49,8 @@ pub(super) struct Libraries<'a> {
 }
 
 impl Libraries<'_> {
-    /// The parts of an OBJ file that names these libraries; `None` if it names none.
-    pub fn read(&mut self, obj: &Path, names: &LibraryNames) -> Result<Option<(Parts, Vec<Part>)>, ImportError> {
-        if names.is_empty() {
-            return Ok(None);
-        }
+    /// The parts of an OBJ file that names these libraries; without any there are no parts.
+    pub fn read(&mut self, obj: &Path, names: &LibraryNames) -> Result<(Parts, Vec<Part>), ImportError> {
         let folder = obj.parent().unwrap_or(Path::new(""));
         let mut parts = Parts { lenient: self.options.substitute, ..Parts::default() };
         let mut made: Vec<Part> = vec![];
@@ -72,7 +69,7 @@ impl Libraries<'_> {
                 }
             }
         }
-        Ok(Some((parts, made)))
+        Ok((parts, made))
     }
 
     /// The files that a `mtllib` statement names: one, or several with blanks in between.

@@ -189,7 +189,12 @@ fn what_cannot_be_read_is_named() {
     assert!(import_with("newmtl m\n", unknown, &lenient).is_ok());
     let late = "f 1 2 3\nmtllib b.mtl\n";
     let error = import_with("newmtl m\n", late, &strict).unwrap_err().to_string();
-    assert!(error.contains("a.obj:9: mtllib \"b.mtl\" stands after the first face"), "{error}");
+    assert!(error.contains("a.obj:9: mtllib \"b.mtl\" stands after the first vertex"), "{error}");
+    // one that is found when the vertices have been read is not passed over
+    let dir = folder();
+    let path = write(&dir, "a.obj", format!("{TRIANGLE}mtllib b.mtl\nusemtl m\nf 1 2 3\n"));
+    let error = import(&path, &strict).unwrap_err().to_string();
+    assert!(error.contains("a.obj:7: mtllib \"b.mtl\" stands after the first vertex"), "{error}");
     let dir = folder();
     let path = write(&dir, "a.obj", format!("mtllib b.mtl c.mtl\n{TRIANGLE}f 1 2 3\n"));
     let error = import(&path, &strict).unwrap_err().to_string();

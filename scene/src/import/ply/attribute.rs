@@ -33,7 +33,7 @@ fn spellings(name: &str) -> Vec<[String; 3]> {
 
 /// The colours that a file's vertices have, else those of its faces; `None` if neither has any. And the bytes read of it.
 pub(in crate::import) fn colors(path: &Path) -> Result<(Option<MeshAttribute>, u64), ImportError> {
-    let mut source = Source::open(path)?;
+    let mut source = Source::open_head(path)?;
     let header = Header::read(&mut source)?;
     let found = [("vertex", false), ("face", true)].into_iter().find_map(|(name, of_faces)| {
         let wanted = MeshAttribute { of_faces, name: "color".into(), srgb: true };
