@@ -17,6 +17,22 @@ def run(command: list) -> tuple:
     return usage.ru_utime + usage.ru_stime, wall, text.decode()
 
 
+def figure(rows: int, columns: int, size: tuple) -> tuple:
+    """A figure to be written as a file, and its axes by row and column."""
+    import matplotlib
+
+    matplotlib.use("svg")
+    import matplotlib.pyplot as plt
+
+    return plt.subplots(rows, columns, figsize=size, squeeze=False)
+
+
+def save(drawn, path) -> None:
+    drawn.tight_layout()
+    drawn.savefig(path)
+    print(f"plots in {path}")
+
+
 def interval(ratios: list) -> tuple:
     """Order statistics that hold the median with at least 95 % (binomial)."""
     r = sorted(ratios)

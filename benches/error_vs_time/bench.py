@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 import scenes
-from measure import run
+from measure import figure, run, save
 
 SIZE = 256
 # where peers are compared at equal error
@@ -116,12 +116,7 @@ def at_error(points: list, target: float) -> float | None:
 
 
 def plot(rows: list, names: list, path: Path) -> None:
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    figure, axes = plt.subplots(2, len(names), figsize=(5.5 * len(names), 9), squeeze=False)
+    drawn, axes = figure(2, len(names), (5.5 * len(names), 9))
     for column, scene in enumerate(names):
         for row, (key, label) in enumerate([("cpu_s", "CPU-seconds from process start"), ("wall_s", "wall seconds from process start")]):
             ax = axes[row][column]
@@ -134,8 +129,7 @@ def plot(rows: list, names: list, path: Path) -> None:
             ax.set(title=scene, xlabel=label, ylabel="relMSE")
             ax.grid(True, which="both", alpha=0.3)
             ax.legend()
-    figure.tight_layout()
-    figure.savefig(path, dpi=80)
+    save(drawn, path)
 
 
 def main() -> None:

@@ -18,6 +18,9 @@ import subprocess
 import sys
 from pathlib import Path
 
+sys.path.insert(0, str(Path(__file__).parents[1]))
+import measure  # noqa: E402
+
 STRATEGIES = {"demand-driven": "DD", "scheduling-grid": "SG without OR", "scheduling-grid-overlap-reduced": "SG with OR", "auto": "auto"}
 ISO = {"chest": -789.5, "head": 1150.5}
 # bytes a second
@@ -95,12 +98,7 @@ def add(a: dict, b: dict) -> dict:
 
 
 def plot(bench: Bench, path: Path) -> None:
-    import matplotlib
-
-    matplotlib.use("svg")
-    import matplotlib.pyplot as plt
-
-    figure, axes = plt.subplots(2, 2, figsize=(13, 9))
+    drawn, axes = measure.figure(2, 2, (13, 9))
     of = lambda n: [r for r in bench.rows if r["figure"] == n]  # noqa: E731
     names = list(STRATEGIES.values())
     for axis, n, key, label in ((axes[0][0], 4, "frames", "frames"), (axes[0][1], 5, "nodes", "nodes"), (axes[1][0], 6, "triangles", "triangles")):
@@ -120,9 +118,7 @@ def plot(bench: Bench, path: Path) -> None:
         axes[1][1].bar([k + 0.2 * i for k in range(len(reads))], reads, width=0.2, label=name)
     axes[1][1].set(title="as Fig. 7", xlabel="node (the second half has 4 slots)", ylabel="MB read", yscale="log")
     axes[1][1].legend()
-    figure.tight_layout()
-    figure.savefig(path)
-    print(f"plots in {path}")
+    measure.save(drawn, path)
 
 
 def main() -> int:

@@ -102,12 +102,7 @@ class Bench:
 
 
 def plot(bench: Bench, path: Path) -> None:
-    import matplotlib
-
-    matplotlib.use("svg")
-    import matplotlib.pyplot as plt
-
-    figure, axes = plt.subplots(2, 3, figsize=(16, 9))
+    drawn, axes = measure.figure(2, 3, (16, 9))
     for column, (key, label) in enumerate((("tax", "CPU over one process"), ("bytes_per_sample", "bytes per sample, disks and network"), ("passes", "passes"))):
         for row, (x, fixed, at) in enumerate((("nodes", "splits", bench.a.fixed_splits), ("splits", "nodes", bench.a.fixed_nodes))):
             axis = axes[row][column]
@@ -121,9 +116,7 @@ def plot(bench: Bench, path: Path) -> None:
             axis.set_ylim(bottom=0)
             if lines:
                 axis.legend(fontsize=7)
-    figure.tight_layout()
-    figure.savefig(path)
-    print(f"plots in {path}")
+    measure.save(drawn, path)
 
 
 def main() -> int:

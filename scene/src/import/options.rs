@@ -4,7 +4,7 @@ use std::str::FromStr;
 
 use super::shapes;
 use super::vector::{cross, look_at, normalize, sub};
-use crate::description::{Affine, Camera, Place, Shape};
+use crate::description::{Affine, Camera, Place, Shape, Substitution};
 
 /// What the caller decides about an import.
 #[derive(Clone, Debug, Default)]
@@ -25,6 +25,23 @@ pub struct ImportOptions {
     pub lights: Vec<Light>,
     /// Radiance of a constant sky, instead of the source's; 0 is no sky.
     pub sky: Option<[f32; 3]>,
+}
+
+impl ImportOptions {
+    /// Notes something unsupported by its place and what it is, or its stand-in where stand-ins are allowed.
+    pub(super) fn note_unsupported(
+        &self,
+        (place, what): (Place, String),
+        stand_in: &str,
+        substitutions: &mut Vec<Substitution>,
+        unsupported: &mut Vec<(Place, String)>,
+    ) {
+        if self.substitute {
+            substitutions.push(Substitution { place, what, stand_in: stand_in.into() });
+        } else {
+            unsupported.push((place, what));
+        }
+    }
 }
 
 /// Reflectance of meshes and volumes.

@@ -33,7 +33,7 @@ use std::path::Path;
 use self::xml::{Document, ObjectId, Property, Value, malformed};
 use super::ImportOptions;
 use crate::ImportError;
-use crate::description::{Affine, Description, Place, Substitution};
+use crate::description::{Affine, Description, Place};
 
 /// Reads a scene file.
 pub(super) fn import(path: &Path, options: &ImportOptions) -> Result<Description, ImportError> {
@@ -77,12 +77,8 @@ struct Converter<'a> {
 impl<'a> Converter<'a> {
     /// Notes something unsupported, or its stand-in when stand-ins are allowed.
     fn unsupported(&mut self, place: &Place, what: impl Into<String>, stand_in: &str) {
-        let (place, what) = (place.clone(), what.into());
-        if self.options.substitute {
-            self.out.substitutions.push(Substitution { place, what, stand_in: stand_in.into() });
-        } else {
-            self.unsupported.push((place, what));
-        }
+        let found = (place.clone(), what.into());
+        self.options.note_unsupported(found, stand_in, &mut self.out.substitutions, &mut self.unsupported);
     }
 
     /// The property of a name, marked as used.

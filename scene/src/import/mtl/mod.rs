@@ -15,7 +15,7 @@ use super::ImportOptions;
 use super::obj::LibraryNames;
 use super::source::Source;
 use crate::ImportError;
-use crate::description::{Description, Material, Note, Parts, Place, Substitution};
+use crate::description::{Description, Material, Note, Parts, Place};
 use statement::Statement;
 
 /// Most materials of one library.
@@ -93,12 +93,8 @@ impl Libraries<'_> {
 
     /// Notes something unsupported, or its stand-in when stand-ins are allowed.
     fn unsupported(&mut self, place: &Place, what: impl Into<String>, stand_in: &str) {
-        let (place, what) = (place.clone(), what.into());
-        if self.options.substitute {
-            self.out.substitutions.push(Substitution { place, what, stand_in: stand_in.into() });
-        } else {
-            self.unsupported.push((place, what));
-        }
+        let found = (place.clone(), what.into());
+        self.options.note_unsupported(found, stand_in, &mut self.out.substitutions, &mut self.unsupported);
     }
 
     /// Once for each file: most materials of a library say the same.
