@@ -31,8 +31,8 @@ const LARGEST: f32 = f32::MAX / 16.0;
 const BINS: usize = 12;
 /// Levels after which sources are halved by number, which bounds the depth.
 const DEEP: usize = 64;
-/// Most levels: those, and as many as halving 2^32 sources three times a level takes.
-const LEVELS: usize = DEEP + 11;
+/// Most levels: those, and as many as halving fewer than 2^32 sources takes, since each level divides its sources once at least.
+const LEVELS: usize = DEEP + 33;
 /// In a child's reference: it is a source.
 const LEAF: u32 = 1 << 31;
 
