@@ -11,7 +11,7 @@ import numpy as np
 import scenes
 from measure import interval, run
 
-SPP = {"cornell": 1024, "gyroid": 256, "veach-mis": 256}
+SPP = {"cornell": 1024, "gyroid": 256, "veach-mis": 256, "staircase": 128, "living-room": 128, "classroom": 128}
 
 MITSUBA = """
 import sys, mitsuba as mi
@@ -45,7 +45,7 @@ def main() -> None:
         spp = SPP[name]
         ours = [a.rayherd, "render", str(xml), "--size", f"{a.size}x{a.size}", "--spp", str(spp), "--max-depth", str(a.max_depth),
                 "-o", str(a.work / "bench.exr")]
-        theirs = [sys.executable, "-c", MITSUBA, str(xml), str(spp), "1"] + [f"{k}={v}" for k, v in values.items()]
+        theirs = [sys.executable, "-c", MITSUBA, str(scenes.read_by_mitsuba(xml)), str(spp), "1"] + [f"{k}={v}" for k, v in values.items()]
         run(theirs)  # fills Mitsuba's kernel cache
         for i in range(a.pairs):
             (co, wo, _), (ct, wt, _) = run(ours), run(theirs)

@@ -43,8 +43,7 @@ def main() -> int:
     names = [n for name in a.names for n in groups.get(name, [name])]
     for name in names:
         xml = scenes.prepare(name, a.shared.resolve(), a.work.resolve(), a.rayherd)
-        other = scenes.theirs(xml) if scenes.theirs(xml).exists() else xml
-        scene = mi.load_file(str(other), **scenes.parameters(xml, a.size, a.max_depth))
+        scene = mi.load_file(str(scenes.read_by_mitsuba(xml)), **scenes.parameters(xml, a.size, a.max_depth))
         spp, renders = (64, 8) if a.quick else scenes.ENOUGH.get(name, (256, 16))
         spp, renders = a.spp or spp, a.renders or renders
         theirs, ours = [], []
