@@ -249,6 +249,7 @@ fn write_primitives(boxes: &[u32], first: u32, out: &mut [u8], value: impl Fn(u3
 }
 
 /// The i-th sphere of a leaf of n.
+#[inline(always)]
 pub(super) fn read_sphere(arena: &[u8], leaf: usize, n: usize, i: usize) -> Sphere {
     let row = |r: usize| read_f32(arena, leaf + (r * n + i) * 4);
     Sphere { center: [row(0), row(1), row(2)], radius: row(3), flipped: row(4).to_bits() != 0 }

@@ -133,17 +133,9 @@ impl Tracer {
 
     fn run_part<const ANY: bool>(&mut self, forest: &Forest, rays: &[Ray], done: &mut impl FnMut(usize, &State)) {
         let Tracer { kernel, counters, stack, sorter, .. } = self;
-        let mut of_spheres = Counters::default();
         // triangles first, then the spheres that are nearer
         let spheres = forest.sphere_root();
-        let mut finish = |i: usize, state: &mut State, stack: &mut scalar::Stack| {
-            if let Some(root) = spheres
-                && !(ANY && state.prim != MISS)
-            {
-                scalar::spheres(forest, root, &rays[i], state, ANY, stack, &mut of_spheres);
-            }
-            done(i, state);
-        };
+        let asks = |state: &State| spheres.filter(|_| !(ANY && state.prim != MISS));
         let order = match (sorter, forest.bounds()) {
             (Some(sorter), Some(bounds)) => sorter.order(bounds, rays),
             _ => &[],
@@ -151,20 +143,30 @@ impl Tracer {
         match kernel {
             #[cfg(target_arch = "x86_64")]
             Kernel::Avx2 | Kernel::Avx512 => {
-                let mut finish = |i: usize, state: &mut State| finish(i, state, stack);
-                wide::trace::<ANY>(*kernel, &mut self.lanes, forest, rays, order, &mut finish, counters);
+                let (kernel, mut of_spheres) = (*kernel, Counters::default());
+                let mut finish = |i: usize, state: &mut State| {
+                    if let Some(root) = asks(state) {
+                        wide::spheres::<ANY>(kernel, forest, root, &rays[i], state, stack, &mut of_spheres);
+                    }
+                    done(i, state);
+                };
+                wide::trace::<ANY>(kernel, &mut self.lanes, forest, rays, order, &mut finish, counters);
+                counters.nodes += of_spheres.nodes;
+                counters.leaves += of_spheres.leaves;
             }
             _ => {
                 for k in 0..rays.len() {
                     let i = order.get(k).map_or(k, |&i| i as usize);
                     let mut state = State::new(&rays[i], forest.largest());
                     scalar::triangles(forest, &mut state, ANY, stack, counters);
-                    finish(i, &mut state, stack);
+                    if let Some(root) = asks(&state) {
+                        let enter = scalar::enter_children;
+                        scalar::spheres(forest, root, &rays[i], &mut state, ANY, stack, counters, enter);
+                    }
+                    done(i, &state);
                 }
             }
         }
-        counters.nodes += of_spheres.nodes;
-        counters.leaves += of_spheres.leaves;
     }
 }
 

@@ -1,5 +1,4 @@
 //! The plain kernel: one ray, one box, one primitive at a time. The vector kernels give its answers to the bit.
-//! Spheres are traced by it always: scenes have few.
 
 use super::super::block::read_sphere;
 use super::super::forest::Forest;
@@ -15,7 +14,7 @@ pub(super) type Stack = Vec<(f32, u32)>;
 /// Traces one ray through the forest's triangles; the first hit found ends it if `any`.
 pub(super) fn triangles(forest: &Forest, state: &mut State, any: bool, stack: &mut Stack, counters: &mut Counters) {
     let arena = forest.arena();
-    traverse(arena, forest.root(), state, stack, counters, |state, leaf| {
+    traverse(arena, forest.root(), state, stack, counters, enter_children, |state, leaf| {
         let (at, n) = (offset(leaf), leaf_len(leaf));
         for i in 0..n {
             if let Some(Intersection { t, uv }) = intersect(state, &read_triangle(arena, at, n, i)) {
@@ -26,7 +25,8 @@ pub(super) fn triangles(forest: &Forest, state: &mut State, any: bool, stack: &m
     });
 }
 
-/// Traces one ray through the forest's spheres; `state` has the best hit so far.
+/// Traces one ray through the forest's spheres; `state` has the best hit so far. `enter` is the box test, as [`enter_children`].
+#[inline(always)]
 pub(super) fn spheres(
     forest: &Forest,
     root: u32,
@@ -35,9 +35,10 @@ pub(super) fn spheres(
     any: bool,
     stack: &mut Stack,
     counters: &mut Counters,
+    enter: impl Fn(&State, &[u8], usize, &mut Stack),
 ) {
     let arena = forest.arena();
-    traverse(arena, root, state, stack, counters, |state, leaf| {
+    traverse(arena, root, state, stack, counters, enter, |state, leaf| {
         let (at, n) = (offset(leaf), leaf_len(leaf));
         for i in 0..n {
             let s = read_sphere(arena, at, n, i);
@@ -50,12 +51,14 @@ pub(super) fn spheres(
 }
 
 /// Visits the leaves whose boxes the ray enters, about nearest first, until `leaf` says that it is enough.
+#[inline(always)]
 fn traverse(
     arena: &[u8],
     root: u32,
     state: &mut State,
     stack: &mut Stack,
     counters: &mut Counters,
+    enter: impl Fn(&State, &[u8], usize, &mut Stack),
     mut leaf: impl FnMut(&mut State, u32) -> bool,
 ) {
     stack.clear();
@@ -74,13 +77,20 @@ fn traverse(
         }
         counters.nodes += 1;
         let first = stack.len();
-        for slot in 0..WIDTH {
-            let (aabb, child) = read_slot(arena, offset(reference), slot);
-            if let Some(entry) = enter(state, &aabb) {
-                stack.push((entry, child));
-            }
+        enter(state, arena, offset(reference), stack);
+        if stack.len() > first + 1 {
+            stack[first..].sort_by(|a, b| b.0.total_cmp(&a.0));
         }
-        stack[first..].sort_by(|a, b| b.0.total_cmp(&a.0));
+    }
+}
+
+/// Pushes those of a node's children that the ray enters, slot by slot.
+pub(super) fn enter_children(state: &State, arena: &[u8], node: usize, stack: &mut Stack) {
+    for slot in 0..WIDTH {
+        let (aabb, child) = read_slot(arena, node, slot);
+        if let Some(entry) = enter(state, &aabb) {
+            stack.push((entry, child));
+        }
     }
 }
 

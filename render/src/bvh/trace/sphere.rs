@@ -14,6 +14,7 @@
 use crate::ray::Ray;
 
 /// Nearest `t` with `tmin < t <= tmax` at which the ray meets the sphere, from inside or outside.
+#[inline(always)]
 pub(super) fn intersect(ray: &Ray, tmin: f32, tmax: f32, center: [f32; 3], radius: f32) -> Option<f32> {
     let d = ray.d.map(f64::from);
     let l: [f64; 3] = std::array::from_fn(|k| f64::from(ray.o[k]) - f64::from(center[k]));
