@@ -251,3 +251,30 @@ fn bytes_come_back_and_bad_ones_do_not() {
     assert!(matches!(SkyMap::new(3, 1, vec![[0.0; 3]; 3]), Err(SkyMapError::Size(3, 1))));
     assert!(!SkyMap::new(3, 2, vec![[0.0; 3]; 6]).unwrap().shines());
 }
+
+/// The guided search finds what a search of the whole row finds, at the ends of intervals and of the guide's parts too.
+#[test]
+fn guided_searches_are_plain_ones() {
+    let mut rng = Rng(21);
+    for width in [1, 2, 15, 16, 17, 100, 1000, 4099] {
+        for dark in [0.0, 0.9, 0.999] {
+            let row = |rng: &mut Rng| {
+                let weights: Vec<f64> =
+                    (0..width).map(|_| if rng.f32() < dark { 0.0 } else { f64::from(rng.f32()).powi(8) }).collect();
+                ends(&weights)
+            };
+            let rows = [row(&mut rng), row(&mut rng)];
+            let guide = Guide::new(&rows.concat(), width);
+            for (k, row) in rows.iter().enumerate() {
+                let part = 1u32 << guide.shift;
+                let edges = row.iter().copied().chain((0..WHOLE / part).map(|i| i * part));
+                let near = edges.flat_map(|n| [n.saturating_sub(1), n, n + 1]).filter(|n| *n < WHOLE);
+                for n in near.chain((0..2000).map(|_| rng.u32() >> 1)).collect::<Vec<_>>() {
+                    let number = n << 1 | rng.u32() & 1;
+                    let plain = choose(row, 0..width, number);
+                    assert_eq!(choose(row, guide.range(k, number), number), plain, "{n} of {width}");
+                }
+            }
+        }
+    }
+}
