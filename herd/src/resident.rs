@@ -5,6 +5,7 @@ use std::sync::{Arc, Condvar, Mutex, MutexGuard, OnceLock, PoisonError};
 
 use rayherd_render::attributes::AttributeBlock;
 use rayherd_render::bvh::Forest;
+use rayherd_render::memory::prefetch;
 use rayherd_render::path::{Surface, Surfaces};
 use rayherd_render::ray::{Hit, PrimId};
 use rayherd_render::world::Primitive;
@@ -234,6 +235,23 @@ impl Surfaces for ResidentSurfaces<'_> {
         match self.resident.forest.primitive(hit) {
             Primitive::Triangle(vertices) if attributes.normals(local).is_none() => Some(vertices),
             _ => None,
+        }
+    }
+    #[inline(always)]
+    fn foresee(&self, hit: &Hit) {
+        let (attributes, local) = self.at(hit.prim);
+        let block = &attributes.block;
+        // the last value too: it may begin on another line
+        if let Some([first, _, last]) = block.normals.get(local) {
+            prefetch(first);
+            prefetch(last);
+        }
+        if let Some([first, _, last]) = block.uvs.get(local) {
+            prefetch(first);
+            prefetch(last);
+        }
+        if let Some(shape) = block.shapes.get(local) {
+            prefetch(shape);
         }
     }
     fn prim(&self, _index: usize, hit: &Hit) -> PrimId {

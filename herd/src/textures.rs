@@ -203,30 +203,28 @@ impl<'a> TaskTextures<'a> {
 impl Textures for TaskTextures<'_> {
     #[inline]
     fn tile(&self, number: u32) -> Option<Ref<'_, [u8]>> {
-        let tiles = self.at_hand.borrow();
-        let place = number as usize % tiles.len();
-        let found = Ref::filter_map(tiles, |tiles| match &tiles[place] {
-            Some((n, tile)) if *n == number => Some(&**tile),
-            _ => None,
-        });
-        match found {
-            Ok(tile) => Some(tile),
-            Err(tiles) => {
-                drop(tiles);
-                self.fetch(number, place)
-            }
-        }
+        self.at_hand(number).or_else(|| self.fetch(number))
+    }
+
+    #[inline]
+    fn at_hand(&self, number: u32) -> Option<Ref<'_, [u8]>> {
+        Ref::filter_map(self.at_hand.borrow(), |tiles| {
+            let held = tiles[number as usize % tiles.len()].as_ref();
+            held.filter(|(n, _)| *n == number).map(|(_, tile)| &**tile)
+        })
+        .ok()
     }
 }
 
 impl TaskTextures<'_> {
     #[cold]
-    fn fetch(&self, number: u32, place: usize) -> Option<Ref<'_, [u8]>> {
+    fn fetch(&self, number: u32) -> Option<Ref<'_, [u8]>> {
         if self.error.borrow().is_some() {
             // the task is over: nothing more is read for it
             return None;
         }
         // what lay here is let go first, so that there is room
+        let place = number as usize % self.at_hand.borrow().len();
         self.at_hand.borrow_mut()[place] = None;
         match self.cache.get(number, self.from) {
             Ok(tile) => self.at_hand.borrow_mut()[place] = Some((number, tile)),

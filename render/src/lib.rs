@@ -15,6 +15,7 @@ pub mod frame;
 pub mod light;
 pub mod material;
 pub mod math;
+pub mod memory;
 pub mod path;
 pub mod ray;
 pub mod sampler;

@@ -3,10 +3,7 @@
 
 use std::ptr::NonNull;
 
-/// Size of a huge page on x86-64 and, most often, on aarch64.
-const HUGE: usize = 2 << 20;
-/// Arenas of so many bytes ask for huge pages; these round up what it takes by less than a quarter.
-const HUGE_FROM: usize = 8 << 20;
+use crate::memory::{HUGE, HUGE_FROM};
 
 /// Zeroed memory that is reserved at once and costs pages only where it was written.
 pub(super) struct Arena {

@@ -126,6 +126,8 @@ pub trait Surfaces {
             _ => None,
         }
     }
+    /// Asks for what [`Surfaces::surface`] of a hit will read, if that may be far.
+    fn foresee(&self, _: &Hit) {}
     /// The global id of what ray `index` hit: asked for where light is met only.
     fn prim(&self, index: usize, hit: &Hit) -> PrimId;
 }

@@ -7,6 +7,7 @@ use super::UvMap;
 use super::texel::Texel;
 use super::tiles::{TILE, Textures};
 use crate::math::luminance;
+use crate::memory::prefetch;
 
 /// What is beyond the image.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -101,6 +102,33 @@ impl Bitmap {
         }
     }
 
+    /// Asks for the texels around a point; where they lie in several tiles, for those of the first.
+    pub(super) fn foresee(&self, tiles: &dyn Textures, uv: [f32; 2]) {
+        let at = self.place(uv, if self.filter == Filter::Nearest { 0.0 } else { 0.5 });
+        let [x, y] = std::array::from_fn(|a| self.wrapped(at[a].floor() as i32, a));
+        let Some(texels) = tiles.at_hand(self.tile_at([x, y])) else { return };
+        let n = self.in_tile([x, y]);
+        let row = self.tile_size([x / TILE, y / TILE])[0] as usize * self.texel_bytes();
+        for at in [n, n + row] {
+            if let Some(texel) = texels.get(at) {
+                prefetch(texel);
+            }
+        }
+    }
+
+    /// The tile that holds a texel.
+    #[inline(always)]
+    fn tile_at(&self, [x, y]: [u32; 2]) -> u32 {
+        self.first_tile + (y / TILE) * self.tiles_each_way()[0] + x / TILE
+    }
+
+    /// Where in its tile a texel begins, bytes.
+    #[inline(always)]
+    fn in_tile(&self, [x, y]: [u32; 2]) -> usize {
+        let [w, _] = self.tile_size([x / TILE, y / TILE]);
+        ((y % TILE) * w + x % TILE) as usize * self.texel_bytes()
+    }
+
     /// One number for a colour of this image.
     #[inline(always)]
     pub(super) fn amount(&self, color: Vec3) -> f32 {
@@ -163,14 +191,9 @@ impl Bitmap {
     /// The texels of two columns and two rows, row by row.
     #[inline(always)]
     fn four(&self, tiles: &dyn Textures, x: [u32; 2], y: [u32; 2]) -> [Vec3; 4] {
-        let across = self.tiles_each_way()[0];
         let at = [[x[0], y[0]], [x[1], y[0]], [x[0], y[1]], [x[1], y[1]]];
-        let read = |texels: &[u8], [x, y]: [u32; 2]| {
-            let [w, _] = self.tile_size([x / TILE, y / TILE]);
-            let n = (y % TILE) * w + x % TILE;
-            self.texel.read(self.channels, texels, n as usize * self.texel_bytes())
-        };
-        let tile = |[x, y]: [u32; 2]| tiles.tile(self.first_tile + (y / TILE) * across + x / TILE);
+        let read = |texels: &[u8], p: [u32; 2]| self.texel.read(self.channels, texels, self.in_tile(p));
+        let tile = |p: [u32; 2]| tiles.tile(self.tile_at(p));
         if x[0] / TILE == x[1] / TILE && y[0] / TILE == y[1] / TILE {
             return tile(at[0]).map_or([Vec3::ZERO; 4], |texels| at.map(|p| read(&texels, p)));
         }

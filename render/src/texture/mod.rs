@@ -108,6 +108,14 @@ impl Texture {
         }
     }
 
+    /// Asks for the texels of a look-up that will come.
+    #[inline]
+    pub(crate) fn foresee(&self, tiles: &dyn Textures, at: At) {
+        if let Texture::Bitmap(bitmap) = self {
+            bitmap.foresee(tiles, at.uv);
+        }
+    }
+
     /// Its first tile and how many it has.
     pub fn tiles(&self) -> std::ops::Range<u32> {
         match self {

@@ -11,6 +11,10 @@ pub trait Textures {
     /// The texels of a tile, by rows without gaps, as [`super::Bitmap::tile_bytes`] says; `None` when they cannot be had. Then the look-up
     /// gives 0: whoever shades asks the implementor for its error before anything that was shaded counts.
     fn tile(&self, number: u32) -> Option<Ref<'_, [u8]>>;
+    /// The same if it costs nothing: a tile that would have to be read is left where it is.
+    fn at_hand(&self, _: u32) -> Option<Ref<'_, [u8]>> {
+        None
+    }
 }
 
 impl fmt::Debug for dyn Textures + '_ {

@@ -17,6 +17,7 @@ use std::f32::consts::PI;
 use glam::Vec3;
 
 use crate::math::{UnitDir, luminance, sincos_turn};
+use crate::memory::{prefetch, spacious};
 
 /// All numbers that choose.
 const WHOLE: u32 = 1 << 31;
@@ -96,7 +97,7 @@ impl SkyMap {
             return Err(SkyMapError::Value { what, x: (i % w) as u32, y: (i / w) as u32 });
         }
         let cosines: Vec<f64> = (0..h).map(|y| libm::cos(std::f64::consts::PI * y as f64 / (h - 1) as f64)).collect();
-        let mut columns = Vec::with_capacity(w * (h - 1));
+        let mut columns = spacious(w * (h - 1));
         let mut of_rows = Vec::with_capacity(h - 1);
         let mut row = vec![0.0f64; w];
         let mut colour = [0.0f64; 3];
@@ -167,6 +168,9 @@ impl SkyMap {
         let (y, down) = choose(&self.rows, self.row_guide.range(0, u[0]), u[0]);
         let w = self.width as usize;
         let (x, along) = choose(&self.columns[y * w..][..w], self.column_guides.range(y, u[1]), u[1]);
+        // whoever samples wants the radiance
+        prefetch(&self.texels[y * w + x]);
+        prefetch(&self.texels[(y + 1) * w + x]);
         let cos = self.cosines[y] + (self.cosines[y + 1] - self.cosines[y]) * down;
         let sin = ((1.0 - cos) * (1.0 + cos)).max(0.0).sqrt() as f32;
         let turn = (x as f64 + 0.5 + along) / f64::from(self.width);
@@ -231,9 +235,9 @@ impl SkyMap {
             return Err(SkyMapError::Format);
         }
         let value = |b: &[u8]| f32::from_le_bytes([b[0], b[1], b[2], b[3]]);
-        let texels =
-            bytes[HEAD..].chunks_exact(12).map(|t| [value(&t[..4]), value(&t[4..8]), value(&t[8..])]).collect();
-        SkyMap::new(width, height, texels)
+        let mut all = spacious(texels as usize);
+        all.extend(bytes[HEAD..].chunks_exact(12).map(|t| [value(&t[..4]), value(&t[4..8]), value(&t[8..])]));
+        SkyMap::new(width, height, all)
     }
 
     /// [`SkyMap::sample`], turned, as it travels.

@@ -1,0 +1,55 @@
+//! What the processor and the system can be told about memory: neither changes a value.
+#![allow(unsafe_code)] // an instruction that reads nothing, and advice to the system
+
+/// Asks for the cache line in which a value begins. Worth it where many values are read that lie in no cache, each a few hundred
+/// instructions after it is known where: the processor waits for one after the other otherwise.
+#[inline(always)]
+pub fn prefetch<T>(place: &T) {
+    #[cfg(target_arch = "x86_64")]
+    // SAFETY: a hint, of an address that may be read; all x86-64 processors know it.
+    unsafe {
+        use std::arch::x86_64::{_MM_HINT_T0, _mm_prefetch};
+        _mm_prefetch::<_MM_HINT_T0>(std::ptr::from_ref(place).cast());
+    }
+    #[cfg(not(target_arch = "x86_64"))]
+    let _ = place;
+}
+
+/// Size of a huge page on x86-64 and, most often, on aarch64.
+pub(crate) const HUGE: usize = 2 << 20;
+/// From so many bytes on huge pages are asked for; they round up what is taken by less than a quarter.
+pub(crate) const HUGE_FROM: usize = 8 << 20;
+
+/// An empty vector with room for so many values, in huge pages if it is large and the system has them: for tables that are read here
+/// and there, where every read would look up its page too.
+pub(crate) fn spacious<T>(count: usize) -> Vec<T> {
+    let mut values = Vec::with_capacity(count);
+    let room: &mut [std::mem::MaybeUninit<T>] = values.spare_capacity_mut();
+    let bytes = std::mem::size_of_val(room);
+    #[cfg(target_os = "linux")]
+    if bytes >= HUGE_FROM {
+        let start = room.as_mut_ptr().cast::<u8>();
+        let skipped = start.align_offset(HUGE).min(bytes);
+        let whole = (bytes - skipped) & !(HUGE - 1);
+        // SAFETY: the range lies in the vector's room; the advice changes none of its bytes, and a system that refuses it keeps small pages.
+        unsafe {
+            libc::madvise(start.add(skipped).cast(), whole, libc::MADV_HUGEPAGE);
+        }
+    }
+    values
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn large_and_small_vectors_hold_what_is_put_in() {
+        for count in [0, 1, 1000, 3 << 20] {
+            let mut values = spacious(count);
+            assert!(values.capacity() >= count);
+            values.extend(0..count as u32);
+            assert!(values.iter().enumerate().all(|(i, &v)| v == i as u32));
+        }
+    }
+}
