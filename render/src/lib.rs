@@ -5,6 +5,11 @@
 
 // `!(x > 0.0)` is true of NaN, which is what is meant
 #![allow(clippy::neg_cmp_op_on_partial_ord)]
+// in f64 some conversions convert nothing, and what only the vector code uses is not used
+#![cfg_attr(
+    feature = "double",
+    allow(clippy::useless_conversion, clippy::unnecessary_cast, dead_code, unused_imports, unused_qualifications)
+)]
 
 pub mod attributes;
 pub mod bvh;
@@ -17,6 +22,7 @@ pub mod material;
 pub mod math;
 pub mod path;
 pub mod ray;
+mod real;
 pub mod sampler;
 pub mod skip;
 #[cfg(test)]

@@ -15,9 +15,10 @@
 //! its cosine is to 1, at most sqrt(2 x 12 x 2^-24) < 0.0012; three of them make less than [`MARGIN`], by which the limit is moved. The sphere
 //! is larger by the rounding of its centre. Whatever is not 0 gets at least as many integers as it has sources, so each of them is chosen sometimes.
 
-use glam::{DVec3, Vec3};
+use glam::DVec3;
 
 use super::bounds::Bounds;
+use crate::real::{Vec3, f32, narrow, wide};
 
 /// By which the cosine of a direction must be beyond the limit for a child to be dark there; as an angle never less than this.
 const MARGIN: f64 = 1.0 / 128.0;
@@ -194,11 +195,11 @@ impl Node {
     };
 
     fn set(&mut self, slot: usize, bounds: &Bounds, total: f64, count: usize, child: u32) {
-        let center = bounds.center().as_vec3();
+        let center = narrow(bounds.center());
         // larger by the centre's rounding and its own
-        let off = (bounds.center() - center.as_dvec3()).length();
+        let off = (bounds.center() - wide(center)).length();
         let radius = (bounds.radius() + off) * (1.0 + 1e-6);
-        let axis = bounds.axis.as_vec3();
+        let axis = narrow(bounds.axis);
         for k in 0..3 {
             (self.center[k][slot], self.axis[k][slot]) = (center[k], axis[k]);
         }

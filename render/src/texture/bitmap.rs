@@ -1,12 +1,12 @@
 //! Images.
 
-use glam::Vec3;
 use serde::{Deserialize, Serialize};
 
 use super::UvMap;
 use super::texel::Texel;
 use super::tiles::{TILE, Textures};
 use crate::math::luminance;
+use crate::real::{Vec3, f32};
 
 /// What is beyond the image.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
