@@ -21,20 +21,26 @@ use rayon::prelude::*;
 /// The film keeps nothing below. In f64 the tails of lobes go on where those in f32 are 0: shadow rays for less than this are none.
 const LEAST: f64 = 1.0 / (1u128 << 64) as f64;
 
+/// What a ray came upon.
+#[derive(Clone, Copy, PartialEq)]
+enum Met {
+    /// A primitive, or nothing.
+    Surface(Option<u64>),
+    /// A light, unless something was in the way.
+    Light(bool),
+}
+
 /// What became of a sample's path.
-#[derive(Clone, Copy, Default)]
+#[derive(Default)]
 struct Traced {
     light: [f64; 3],
     /// Rays to the nearest hit.
     rays: u32,
-    /// Names what was met, in order, and which shadow rays arrived.
-    way: u64,
+    /// What was met, in order, and which shadow rays arrived.
+    way: Vec<Met>,
 }
 
 impl Traced {
-    fn meets(&mut self, what: u64) {
-        self.way = (self.way ^ what).wrapping_mul(0x9e37_79b9_7f4a_7c15).rotate_left(29);
-    }
     fn add(&mut self, light: [f64; 3]) {
         (0..3).for_each(|c| self.light[c] += light[c]);
     }
@@ -144,7 +150,7 @@ macro_rules! build {
                         tracer.closest(&scene.forest, &[ray.ray()], &mut hits);
                         let is_hit = hits[0].is_hit();
                         traced.rays += 1;
-                        traced.meets(if is_hit { scene.forest.prim_id(hits[0].prim) } else { u64::MAX });
+                        traced.way.push(Met::Surface(is_hit.then(|| scene.forest.prim_id(hits[0].prim))));
                         shade(&context, *scene, &[ray], &hits, out);
                         for light in &out.light {
                             traced.add(light.value.map(f64::from));
@@ -155,7 +161,7 @@ macro_rules! build {
                             }
                             let mut occluded = [false];
                             tracer.any(&scene.forest, &[shadow.ray()], &mut occluded);
-                            traced.meets(2 + u64::from(occluded[0]));
+                            traced.way.push(Met::Light(!occluded[0]));
                             if !occluded[0] {
                                 traced.add(shadow.contribution.map(f64::from));
                             }
@@ -220,9 +226,10 @@ struct Sums {
     /// Of the differences of luminance, f32 less f64, and their squares: of all paths, and of those that did not part.
     difference: [[f64; 2]; 2],
     luminance: f64,
-    /// With another number of rays, and on another way.
+    /// With another number of rays.
     longer: u64,
-    parted: u64,
+    /// On another way: since a ray met another surface, a shadow ray had another answer, or only one of both had one.
+    parted: [u64; 3],
     /// Not finite in f32, in f64: left out.
     broken: [u64; 2],
     /// Of |difference| / luminance of paths that did not part: largest.
@@ -243,7 +250,7 @@ impl Sums {
         }
         self.luminance += o.luminance;
         self.longer += o.longer;
-        self.parted += o.parted;
+        (0..3).for_each(|k| self.parted[k] += o.parted[k]);
         self.worst = self.worst.max(o.worst);
         self.between += o.between;
         self
@@ -263,17 +270,26 @@ fn row(scenes: (&single::Scene, &double::Scene), size: [u32; 2], y: u32, spp: u3
         let mut halves = [[[0.0; 3]; 2]; 2];
         for sample in 0..spp {
             let traced = [single.trace(pixel, sample), double.trace(pixel, sample)];
-            let broken = traced.map(|t| !t.light.iter().all(|x| x.is_finite()));
+            let broken = [0, 1].map(|k| !traced[k].light.iter().all(|x| x.is_finite()));
             (0..2).for_each(|k| sums.broken[k] += u64::from(broken[k]));
             if broken != [false; 2] {
                 continue;
             }
-            let [a, b] = traced.map(|t| luminance(t.light));
-            let parted = traced[0].way != traced[1].way;
+            let [a, b] = [0, 1].map(|k| luminance(traced[k].light));
+            let mut ways = traced[0].way.iter().zip(&traced[1].way);
+            let parting = ways.find(|(a, b)| a != b);
+            // one may end where the other goes on
+            let parted = parting.is_some() || traced[0].way.len() != traced[1].way.len();
             sums.paths += 1;
             sums.luminance += b;
             sums.longer += u64::from(traced[0].rays != traced[1].rays);
-            sums.parted += u64::from(parted);
+            if parted {
+                sums.parted[match parting {
+                    Some((Met::Surface(_), Met::Surface(_))) => 0,
+                    Some((Met::Light(_), Met::Light(_))) => 1,
+                    _ => 2,
+                }] += 1;
+            }
             sums.difference[0][0] += a - b;
             sums.difference[0][1] += (a - b) * (a - b);
             if !parted {
@@ -334,6 +350,7 @@ fn compare(arguments: &Arguments) -> anyhow::Result<Sums> {
 
 fn report(path: &str, s: Sums, size: [u32; 2]) {
     let n = s.paths as f64;
+    let parted: u64 = s.parted.iter().sum();
     let channels = 3.0 * f64::from(size[0]) * f64::from(size[1]);
     // of a mean of differences, relative to the picture's mean
     let relative = |[sum, squares]: [f64; 2]| {
@@ -360,11 +377,13 @@ fn report(path: &str, s: Sums, size: [u32; 2]) {
         s.noise[1] / channels
     );
     println!(
-        "  parted: {} ({:.1e}), with another number of rays: {} ({:.1e}); not finite: {} in f32, {} in f64",
-        s.parted,
-        s.parted as f64 / n,
+        "  parted: {} ({:.1e}; {} by another surface, {} by a shadow ray's answer, {} by one that only one of both had), with another number of rays: {}; not finite: {} in f32, {} in f64",
+        parted,
+        parted as f64 / n,
+        s.parted[0],
+        s.parted[1],
+        s.parted[2],
         s.longer,
-        s.longer as f64 / n,
         s.broken[0],
         s.broken[1]
     );
@@ -384,7 +403,8 @@ mod tests {
             report(name, sums, of.size);
             assert_eq!((sums.paths, sums.broken), (24 * 24 * 4, [0; 2]));
             assert!(sums.luminance > 0.0 && sums.difference[1][1] > 0.0, "{name}: f64 is f32");
-            assert!(sums.parted < sums.paths / 100, "{name}: {} paths parted", sums.parted);
+            let parted: u64 = sums.parted.iter().sum();
+            assert!(parted < sums.paths / 100, "{name}: {parted} paths parted");
             let rounding = sums.difference[1][0] / sums.luminance;
             // through glass a rounding grows: a hundredth of a path's light, of a few paths
             assert!(rounding.abs() < 1e-3, "{name}: f32 brings {rounding:e} more");
