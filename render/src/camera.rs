@@ -3,6 +3,7 @@
 use serde::{Deserialize, Serialize};
 
 use crate::math::{concentric_disk, unit};
+use crate::real::f32;
 
 /// A camera, ready to make rays: a point (x, y) of the film in pixels, from the upper left corner, stands for `corner + x right + y down`.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]

@@ -2,6 +2,8 @@
 
 use bytemuck::{Pod, Zeroable};
 
+use crate::real::f32;
+
 /// A ray as the kernel takes it: the points `o + t d` with `tmin < t <= tmax`.
 ///
 /// `d` need not be of unit length; `t` is in units of `|d|`. A negative `tmin` counts as 0.
@@ -20,7 +22,8 @@ pub struct Ray {
 
 /// The nearest hit of a ray, or none (`prim == MISS`).
 #[repr(C)]
-#[derive(Clone, Copy, Debug, PartialEq, Pod, Zeroable)]
+#[derive(Clone, Copy, Debug, PartialEq)]
+#[cfg_attr(not(feature = "double"), derive(Pod, Zeroable))]
 pub struct Hit {
     /// Ray parameter of the hit.
     pub t: f32,

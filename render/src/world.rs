@@ -1,12 +1,11 @@
 //! The small, global part of a prepared scene: materials, textures, shapes, lights. Every task holds it.
 
-use std::f32::consts::FRAC_1_PI;
-
-use glam::Vec3;
 use serde::{Deserialize, Serialize};
 
 use crate::material::Material;
 use crate::ray::PrimId;
+use crate::real::consts::FRAC_1_PI;
+use crate::real::{Vec3, atan2, f32};
 use crate::texture::{At, Bitmap, Texture};
 
 /// Materials, textures, shapes, emitters and sky of a scene, in recentred f32 coordinates.
@@ -235,8 +234,8 @@ pub(crate) fn interpolated<const N: usize>([a, b, c]: &[[f32; N]; 3], u: f32, v:
 
 /// Texture coordinates of a sphere where its outward unit normal is `n`: longitude and colatitude from z, in [0, 1].
 pub fn sphere_uv(n: Vec3) -> [f32; 2] {
-    let turn = libm::atan2f(n.y, n.x) * (0.5 * FRAC_1_PI);
-    let v = libm::atan2f((n.x * n.x + n.y * n.y).sqrt(), n.z) * FRAC_1_PI;
+    let turn = atan2(n.y, n.x) * (0.5 * FRAC_1_PI);
+    let v = atan2((n.x * n.x + n.y * n.y).sqrt(), n.z) * FRAC_1_PI;
     [if turn < 0.0 { turn + 1.0 } else { turn }, v]
 }
 

@@ -9,6 +9,7 @@ use super::regions::Regions;
 use super::top::Top;
 use super::trace::read_triangle;
 use crate::ray::{Hit, MISS, PrimId};
+use crate::real::real;
 use crate::world::Primitive;
 
 /// Blocks in memory, ready to be traced.
@@ -253,7 +254,8 @@ impl Forest {
         assert!(i < n && read_u32(leaf, (INDEX_ROW * n + i) * 4) == hit.prim, "a hit of another forest");
         if self.sphere_root().is_some() && !self.is_triangle(hit.prim) {
             let Sphere { center, radius, flipped } = read_sphere(leaf, 0, n, i);
-            return Primitive::Sphere { center, radius, flipped };
+            let [x, y, z] = center;
+            return Primitive::Sphere { center: [real(x), real(y), real(z)], radius: real(radius), flipped };
         }
         Primitive::Triangle(read_triangle(leaf, 0, n, i))
     }

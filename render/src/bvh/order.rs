@@ -4,6 +4,7 @@
 //! in the order of pixels, and in small forests.
 
 use crate::ray::Ray;
+use crate::real::{Stored, f32, real};
 
 /// Bits of an axis in the code: 32^3 cells.
 const BITS: u32 = 5;
@@ -20,7 +21,8 @@ pub(super) struct Sorter {
 
 impl Sorter {
     /// Numbers of the rays by the Morton code of the origin's cell in the box; of one cell in the order given.
-    pub fn order(&mut self, (lo, hi): ([f32; 3], [f32; 3]), rays: &[Ray]) -> &[u32] {
+    pub fn order(&mut self, (lo, hi): ([Stored; 3], [Stored; 3]), rays: &[Ray]) -> &[u32] {
+        let (lo, hi) = (lo.map(real), hi.map(real));
         let cells = (1 << BITS) as f32;
         // a flat box gives infinity, and 0 * infinity a NaN, which becomes cell 0
         let scale: [f32; 3] = std::array::from_fn(|k| cells / (hi[k] - lo[k]));

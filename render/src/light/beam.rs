@@ -1,10 +1,8 @@
 //! Light that arrives from one direction: points, spots, parallel light.
 
-use std::f32::consts::PI;
-
-use glam::Vec3;
-
 use crate::math::{gamma, luminance};
+use crate::real::consts::PI;
+use crate::real::{Vec3, asin, f32};
 use crate::world::Beam;
 
 /// What stands for the density of a single direction, 2^64: large enough that no BSDF's density counts beside it (the power heuristic gives the
@@ -46,7 +44,7 @@ fn unlimited(beam: &Beam, o: Vec3) -> Option<(Vec3, f32, Vec3)> {
             let (d, tmax, falloff) = towards(o, position.into())?;
             // by the chord, which keeps small angles exact
             let sine = 0.5 * (Vec3::from(axis) + d).length();
-            let angle = 2.0 * libm::asinf(sine.min(1.0));
+            let angle = 2.0 * asin(sine.min(1.0));
             let inside = if angle <= beam { 1.0 } else { (cutoff - angle) / (cutoff - beam) };
             (inside > 0.0).then(|| (d, tmax, Vec3::from(intensity) * (falloff * inside)))
         }

@@ -2,10 +2,11 @@
 
 use std::f64::consts::{FRAC_PI_2, PI};
 
-use glam::{DVec3, Vec3};
+use glam::DVec3;
 
 use super::{Geometry, Source};
 use crate::math::luminance;
+use crate::real::{Vec3, wide};
 use crate::world::Beam;
 
 /// Bounds of sources.
@@ -30,8 +31,8 @@ impl Bounds {
     pub(super) fn new(source: &Source) -> Option<Bounds> {
         let radiance = f64::from(luminance(source.emission));
         let around = |center: Vec3, radius: f64, intensity: f64| Bounds {
-            lo: center.as_dvec3() - radius,
-            hi: center.as_dvec3() + radius,
+            lo: wide(center) - radius,
+            hi: wide(center) + radius,
             axis: DVec3::Z,
             normals: PI,
             emission: FRAC_PI_2,
@@ -39,12 +40,12 @@ impl Bounds {
         };
         match &source.geometry {
             Geometry::Triangle(t) => {
-                let p = t.p0.as_dvec3();
-                let (a, b) = (p + t.e1.as_dvec3(), p + t.e2.as_dvec3());
+                let p = wide(t.p0);
+                let (a, b) = (p + wide(t.e1), p + wide(t.e2));
                 Some(Bounds {
                     lo: p.min(a).min(b),
                     hi: p.max(a).max(b),
-                    axis: t.normal.as_dvec3(),
+                    axis: wide(t.normal),
                     normals: 0.0,
                     emission: FRAC_PI_2,
                     intensity: radiance * f64::from(t.area()),
@@ -59,7 +60,7 @@ impl Bounds {
                 Some(around(Vec3::from(*position), 0.0, f64::from(luminance(Vec3::from(*intensity)))))
             }
             Geometry::Beam(Beam::Spot { position, axis, intensity, beam, cutoff, .. }) => Some(Bounds {
-                axis: Vec3::from(*axis).as_dvec3(),
+                axis: wide(Vec3::from(*axis)),
                 normals: f64::from(*beam),
                 emission: f64::from(*cutoff) - f64::from(*beam),
                 ..around(Vec3::from(*position), 0.0, f64::from(luminance(Vec3::from(*intensity))))

@@ -23,10 +23,9 @@ mod triangle;
 
 use std::sync::Arc;
 
-use glam::Vec3;
-
 use crate::math::{luminance, unit};
 use crate::ray::PrimId;
+use crate::real::{Vec3, f32};
 use crate::texture::At;
 use crate::world::{Beam, Glow, Primitive, World, sphere_uv};
 use bounds::Bounds;

@@ -5,11 +5,10 @@
 
 use std::sync::Arc;
 
-use glam::Vec3;
-
 use super::sun::Sun;
 use super::{SkyMap, sphere};
 use crate::math::{UnitDir, luminance};
+use crate::real::{Vec3, f32};
 use crate::world::{Environment, World};
 
 /// All numbers that choose between sun and dome.

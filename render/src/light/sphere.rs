@@ -1,10 +1,8 @@
 //! A sphere that emits evenly from one side, and the uniform sphere of directions.
 
-use std::f32::consts::PI;
-
-use glam::Vec3;
-
 use crate::math::{Basis, gamma, sincos_turn};
+use crate::real::consts::PI;
+use crate::real::{Vec3, f32};
 
 /// Density of [`uniform`].
 pub(super) const UNIFORM_PDF: f32 = 1.0 / (4.0 * PI);

@@ -1,10 +1,8 @@
 //! A disk that shines evenly from infinitely far away.
 
-use std::f32::consts::PI;
-
-use glam::Vec3;
-
 use crate::math::{Basis, UnitDir, luminance, sincos_turn, unit};
+use crate::real::consts::PI;
+use crate::real::{Vec3, f32};
 use crate::world;
 
 /// The sun, sampled evenly by solid angle.

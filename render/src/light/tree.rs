@@ -15,9 +15,10 @@
 //! its cosine is to 1, at most sqrt(2 x 12 x 2^-24) < 0.0012; three of them make less than [`MARGIN`], by which the limit is moved. The sphere
 //! is larger by the rounding of its centre. Whatever is not 0 gets at least as many integers as it has sources, so each of them is chosen sometimes.
 
-use glam::{DVec3, Vec3};
+use glam::DVec3;
 
 use super::bounds::Bounds;
+use crate::real::{Vec3, f32, narrow, wide};
 
 /// By which the cosine of a direction must be beyond the limit for a child to be dark there; as an angle never less than this.
 const MARGIN: f64 = 1.0 / 128.0;
@@ -194,11 +195,11 @@ impl Node {
     };
 
     fn set(&mut self, slot: usize, bounds: &Bounds, total: f64, count: usize, child: u32) {
-        let center = bounds.center().as_vec3();
+        let center = narrow(bounds.center());
         // larger by the centre's rounding and its own
-        let off = (bounds.center() - center.as_dvec3()).length();
+        let off = (bounds.center() - wide(center)).length();
         let radius = (bounds.radius() + off) * (1.0 + 1e-6);
-        let axis = bounds.axis.as_vec3();
+        let axis = narrow(bounds.axis);
         for k in 0..3 {
             (self.center[k][slot], self.axis[k][slot]) = (center[k], axis[k]);
         }
@@ -227,6 +228,8 @@ impl Node {
     /// What may arrive at `o` from child `k` on a surface that faces it, roughly; 0 only if nothing does, or there is no child.
     #[inline(always)]
     pub(crate) fn importance(&self, k: usize, o: Vec3) -> f32 {
+        // read whether needed or not: what is read in one branch only is gathered in vector code
+        let (intensity, near) = (self.intensity[k], self.near[k]);
         let [x, y, z] = [o.x - self.center[0][k], o.y - self.center[1][k], o.z - self.center[2][k]];
         let d2 = x * x + y * y + z * z;
         let far = 1.0 / d2;
@@ -243,7 +246,7 @@ impl Node {
         let (cos, _) = less((cos, sin), (beside, of_sphere));
         let is_beyond = d2 > self.radius2[k];
         let cos = if is_beyond { cos } else { 1.0 };
-        let strength = self.intensity[k] * if is_beyond { far } else { self.near[k] };
+        let strength = intensity * if is_beyond { far } else { near };
         let importance = strength * if cos > GRAZING { cos } else { GRAZING };
         // NaN too becomes a number: a point that is none chooses something
         let importance = if importance > f32::MIN_POSITIVE { importance } else { f32::MIN_POSITIVE };
@@ -279,9 +282,20 @@ impl Node {
 pub(crate) fn end((part, all): (f32, f32), (before, count): (u32, u32), length: u64) -> u64 {
     // each source has one number for sure; what is dealt out is below 2^32, as there is one
     let free = length.saturating_sub(u64::from(count));
-    let end = u64::from(before) + ((free * u64::from((part / all * BELOW_2_32) as u32)) >> 32);
+    let end = u64::from(before) + ((free * u64::from(whole(part / all * BELOW_2_32))) >> 32);
     // the last that shines ends it, whatever was rounded
     if before < count && end < length { end } else { length }
+}
+
+/// `x as u32` of a number in [0, 2^32), by operations that vectors have; of others any number.
+#[inline(always)]
+pub(super) fn whole(x: f32) -> u32 {
+    // 2^52: the last place of a sum with it is 1
+    const SHIFT: f64 = 4_503_599_627_370_496.0;
+    let x = f64::from(x);
+    let nearest = (x + SHIFT) - SHIFT;
+    let below = if nearest > x { nearest - 1.0 } else { nearest };
+    (below + SHIFT).to_bits() as u32
 }
 
 /// The largest f32 below 2^32.

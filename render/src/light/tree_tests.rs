@@ -3,6 +3,7 @@
 use glam::DVec3;
 
 use super::tests::world;
+use super::tree::whole;
 use super::*;
 use crate::testing::{Rng, chi_square};
 use crate::world::Environment;
@@ -218,5 +219,20 @@ fn odd_trees() {
             assert!(numbers.iter().all(|&n| n > 0), "{o}: {numbers:?}");
             assert!(lights.choose(o, rng.u32()).0.is_some_and(|c| c.probability > 0.0));
         }
+    }
+}
+
+/// What vectors do is what the cast does, over all that occurs.
+#[test]
+fn whole_numbers_are_those_of_the_cast() {
+    let mut rng = Rng(35);
+    let ends =
+        [0.0, 1e-30, 0.5, 0.999_999_94, 1.0, 1.5, 2.5, 8_388_607.5, 16_777_215.0, 2_147_483_648.0, 4_294_967_040.0];
+    for x in ends {
+        assert_eq!(whole(x), x as u32, "{x}");
+    }
+    for _ in 0..1_000_000 {
+        let x = rng.f32() * libm::exp2f((rng.u32() % 33) as f32);
+        assert_eq!(whole(x), x as u32, "{x}");
     }
 }

@@ -1,8 +1,7 @@
 //! A triangle that emits evenly from its front.
 
-use glam::Vec3;
-
 use crate::math::gamma;
+use crate::real::{Vec3, f32, narrow, wide};
 
 /// A triangle, sampled uniformly by area.
 #[derive(Clone, Copy, Debug)]
@@ -33,14 +32,14 @@ impl TriangleLight {
         let v = v.map(Vec3::from);
         let (e1, e2) = (v[1] - v[0], v[2] - v[0]);
         // in f64: the cross product of a thin triangle cancels
-        let n = e1.as_dvec3().cross(e2.as_dvec3());
+        let n = wide(e1).cross(wide(e2));
         let length = n.length();
         let bound = v[0].abs().max(v[1].abs()).max(v[2].abs());
         TriangleLight {
             p0: v[0],
             e1,
             e2,
-            normal: if length > 0.0 { (n / length).as_vec3() } else { Vec3::ZERO },
+            normal: if length > 0.0 { narrow(n / length) } else { Vec3::ZERO },
             area: (0.5 * length) as f32,
             error: bound.length() * gamma(8),
         }

@@ -1,6 +1,6 @@
 //! Fresnel reflectance of metals.
 
-use glam::Vec3;
+use crate::real::{Vec3, f32};
 
 /// Unpolarised reflectance of a metal of index `eta + i k` in vacuum at cosine `cos`, times `factor`, per channel (the exact formula: Lagarde,
 /// "Memo on Fresnel equations", 2013; Born and Wolf, section 14.2).

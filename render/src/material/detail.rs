@@ -2,10 +2,10 @@
 //!
 //! A material without any of it has no detail and pays for none. Else a hit looks up what it needs and goes on with a plain [`Bsdf`].
 
-use glam::Vec3;
 use serde::{Deserialize, Serialize};
 
 use super::{Bsdf, Material, Principled};
+use crate::real::{Vec3, f32};
 use crate::texture::{At, Texture, Textures};
 
 /// A parameter of a [`Bsdf`] that a texture may give.

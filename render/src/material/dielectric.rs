@@ -4,10 +4,9 @@
 //! sampled. Radiance is divided by the square of the relative index when it crosses (Veach 1997, section 5.2), as a path from the
 //! camera needs it.
 
-use glam::Vec3;
-
 use super::rough::Rough;
 use super::{Sampled, Scatter};
+use crate::real::{Vec3, f32};
 
 /// Unpolarised reflectance and the cosine of the refracted ray, for a ray at cosine `cos` (in [0, 1]) in a medium from which the other
 /// side has index `eta` (Born and Wolf, section 1.5). Total reflection: (1, 0).

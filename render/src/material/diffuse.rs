@@ -1,11 +1,9 @@
 //! Lambertian reflection.
 
-use std::f32::consts::FRAC_1_PI;
-
-use glam::Vec3;
-
 use super::Scatter;
 use crate::math::concentric_disk;
+use crate::real::consts::FRAC_1_PI;
+use crate::real::{Vec3, f32};
 
 #[inline(always)]
 pub(super) fn eval(reflectance: [f32; 3], wo: Vec3, wi: Vec3) -> Scatter {

@@ -14,7 +14,6 @@ mod rough;
 #[cfg(test)]
 mod tests;
 
-use glam::Vec3;
 use serde::{Deserialize, Serialize};
 
 pub use detail::{Amount, Blend, Detail, Relief, ReliefKind, Slot, Textured};
@@ -25,6 +24,8 @@ use dielectric::RoughInterface;
 use phong::Phong;
 use plastic::Coated;
 use rough::Rough;
+
+use crate::real::{Vec3, f32};
 
 /// Microfacet distribution.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]

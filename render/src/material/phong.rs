@@ -1,12 +1,10 @@
 //! The modified Phong model: a diffuse part, and a lobe cos^n about the mirror's direction (Lafortune and Willems 1994, "Using the Modified Phong
 //! Reflectance Model for Physically Based Rendering"). Mitsuba 0.5's `phong`.
 
-use std::f32::consts::{FRAC_1_PI, PI};
-
-use glam::Vec3;
-
 use super::{Sampled, Scatter, diffuse};
 use crate::math::{Basis, sincos_turn};
+use crate::real::consts::{FRAC_1_PI, PI};
+use crate::real::{Vec3, expm1, f32, log, pow};
 
 /// The model at a point.
 pub(super) struct Phong {
@@ -34,7 +32,7 @@ impl Phong {
             return Scatter::NONE;
         }
         let cos = Vec3::new(-wo.x, -wo.y, wo.z).dot(wi);
-        let power = if cos > 0.0 { libm::powf(cos.min(1.0), self.exponent) } else { 0.0 };
+        let power = if cos > 0.0 { pow(cos.min(1.0), self.exponent) } else { 0.0 };
         let lobe = power * (0.5 / PI);
         let value = (self.diffuse * FRAC_1_PI + self.specular * (lobe * (self.exponent + 2.0))) * wi.z;
         let pdf = self.probability * lobe * (self.exponent + 1.0) + (1.0 - self.probability) * wi.z * FRAC_1_PI;
@@ -49,7 +47,7 @@ impl Phong {
             return None;
         }
         // cos = u^(1 / (n + 1)), and its sine without cancellation
-        let sin2 = -libm::expm1f(2.0 * libm::logf(1.0 - u[0]) / (self.exponent + 1.0));
+        let sin2 = -expm1(2.0 * log(1.0 - u[0]) / (self.exponent + 1.0));
         let (s, c) = sincos_turn(u[1]);
         let sin = sin2.clamp(0.0, 1.0).sqrt();
         let about = Basis::new(Vec3::new(-wo.x, -wo.y, wo.z));

@@ -4,14 +4,13 @@
 //! coat by Fresnel's transmittance, is scattered by the base, and what the coat throws back inside is summed as a geometric series. What is
 //! lost by the rough coat's single scattering is lost.
 
-use std::f32::consts::FRAC_1_PI;
-
-use glam::Vec3;
 use serde::{Deserialize, Serialize};
 
 use super::dielectric::fresnel;
 use super::rough::Rough;
 use super::{Distribution, Sampled, Scatter, diffuse};
+use crate::real::consts::FRAC_1_PI;
+use crate::real::{Vec3, f32};
 
 /// Entries of [`Transmittance`], at cosines evenly from 0 to 1.
 const ENTRIES: usize = 64;

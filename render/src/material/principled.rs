@@ -4,15 +4,14 @@
 //! A metal or a dielectric by one GGX lobe (visible normals sampled), a diffuse base with retro-reflection or flattened towards subsurface scattering,
 //! sheen, and a coat (GTR1). With sheen, coat and base each at their fullest more light may come out than went in: that is the model's.
 
-use std::f32::consts::{FRAC_1_PI, PI};
-
-use glam::Vec3;
 use serde::{Deserialize, Serialize};
 
 use super::dielectric::fresnel;
 use super::rough::Rough;
 use super::{Distribution, Sampled, Scatter, diffuse, relative};
 use crate::math::{luminance, sincos_turn};
+use crate::real::consts::{FRAC_1_PI, PI};
+use crate::real::{Vec3, expm1, f32, log};
 
 /// Parameters, in [0, 1] unless said.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
@@ -257,7 +256,7 @@ struct Gtr1 {
 impl Gtr1 {
     fn new(alpha: f32) -> Gtr1 {
         let alpha2 = alpha * alpha;
-        Gtr1 { alpha2, log: libm::logf(alpha2) }
+        Gtr1 { alpha2, log: log(alpha2) }
     }
 
     fn density(&self, m: Vec3) -> f32 {
@@ -269,7 +268,7 @@ impl Gtr1 {
     /// A normal of density `density(m) m.z` in solid angle.
     fn sample(&self, u: [f32; 2]) -> Vec3 {
         // sin^2 = (alpha^2(1 - u) - alpha^2) / (1 - alpha^2)
-        let sin2 = (self.alpha2 * libm::expm1f(-u[1] * self.log) / (1.0 - self.alpha2)).clamp(0.0, 1.0);
+        let sin2 = (self.alpha2 * expm1(-u[1] * self.log) / (1.0 - self.alpha2)).clamp(0.0, 1.0);
         let (s, c) = sincos_turn(u[0]);
         let sin = sin2.sqrt();
         Vec3::new(sin * c, sin * s, (1.0 - sin2).sqrt())

@@ -4,12 +4,10 @@
 //! as in Mitsuba, masking and shadowing are independent (separable). Beckmann's masking is the exact one, not a rational fit, so that the
 //! density of what is sampled integrates to 1.
 
-use std::f32::consts::PI;
-
-use glam::Vec3;
-
 use super::{Distribution, Scatter};
 use crate::math::sincos_turn;
+use crate::real::consts::PI;
+use crate::real::{Vec3, erf, exp, f32, log};
 
 /// Least roughness; below it use a smooth metal (Mitsuba clamps likewise).
 const LEAST: f32 = 1e-4;
@@ -85,7 +83,7 @@ impl Rough {
             Distribution::Beckmann => {
                 let z2 = m.z * m.z;
                 let z4 = z2 * z2;
-                let e = libm::expf(-slope2 / z2);
+                let e = exp(-slope2 / z2);
                 if e > 0.0 { e / (norm * z4) } else { 0.0 }
             }
         }
@@ -106,8 +104,8 @@ impl Rough {
                 if a >= 4.0 {
                     return 1.0;
                 }
-                let e = libm::expf(-a * a);
-                2.0 / (1.0 + libm::erff(a) + e / (a * PI.sqrt()))
+                let e = exp(-a * a);
+                2.0 / (1.0 + erf(a) + e / (a * PI.sqrt()))
             }
         }
     }
@@ -172,7 +170,7 @@ fn visible_slope(cot: f64, u: f64) -> f32 {
 /// `erfinv(2 u - 1)`: the slope of a Beckmann surface of roughness 1 along one axis (Giles 2012, "Approximating the erfinv function", single precision).
 fn slope_quantile(u: f32) -> f32 {
     let x = (2.0 * u - 1.0).clamp(-0.999_999_9, 0.999_999_9);
-    let w = -libm::logf((1.0 - x) * (1.0 + x));
+    let w = -log((1.0 - x) * (1.0 + x));
     let p = if w < 5.0 {
         let w = w - 2.5;
         [

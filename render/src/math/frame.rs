@@ -1,6 +1,6 @@
 //! Orthonormal frames.
 
-use glam::Vec3;
+use crate::real::{Vec3, f32};
 
 /// A right-handed orthonormal frame; local z is the normal.
 #[derive(Clone, Copy, Debug)]

@@ -1,5 +1,8 @@
 //! Small mathematics that is the same bits on every machine: directions, frames, error bounds, hashes, sine and cosine.
 
+use crate::real::{Vec3, f32};
+
+#[cfg_attr(feature = "double", path = "dir_double.rs")]
 mod dir;
 mod frame;
 pub mod hash;
@@ -12,8 +15,6 @@ pub use dir::UnitDir;
 pub use frame::Basis;
 pub use offset::{Position, gamma, offset_origin};
 pub use trig::{concentric_disk, sincos_turn};
-
-use glam::Vec3;
 
 /// Luminance of linear Rec. 709.
 pub fn luminance(c: Vec3) -> f32 {

@@ -1,6 +1,6 @@
 //! Error bounds of computed points, and origins of rays that leave a surface without meeting it again.
 
-use glam::Vec3;
+use crate::real::{SIGN, Signed, Vec3, f32};
 
 /// Bound of the relative error of `n` successive roundings: n u / (1 - n u), u = 2^-24 (Higham 2002, lemma 3.1).
 #[inline(always)]
@@ -70,7 +70,7 @@ pub fn offset_origin(at: &Position, n: Vec3) -> Vec3 {
         // one ulp up for a positive n, down for a negative one: by the bits, in the direction of o's own sign or against it. At 0 the
         // step would be to the other sign's NaNs: a component of exactly 0 stays.
         let bits = o.to_bits();
-        let step = 1 - ((n.to_bits() ^ bits) >> 31 << 1) as i32;
+        let step = 1 - ((n.to_bits() ^ bits) >> SIGN << 1) as Signed;
         let moved = f32::from_bits(bits.wrapping_add_signed(step));
         if (o == 0.0) | (n == 0.0) { o } else { moved }
     };

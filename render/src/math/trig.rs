@@ -1,15 +1,23 @@
 //! Sine and cosine of fractions of a turn, and the disk map that needs them: own polynomials, plain f32 operations.
 
-use std::f32::consts::{FRAC_PI_2, FRAC_PI_4};
+use crate::real::consts::{FRAC_PI_2, FRAC_PI_4};
+use crate::real::f32;
 
 /// `(sin x, cos x)` for `|x| <= pi / 4`: Taylor polynomials to x^9 and x^8, remainders 4e-9 and 3e-8 times the first
 /// missing term at the end; with rounding below 1.2e-7.
+#[cfg(not(feature = "double"))]
 #[inline(always)]
 fn sincos_small(x: f32) -> (f32, f32) {
     let z = x * x;
     let s = x + x * z * (-1.666_666_7e-1 + z * (8.333_333e-3 + z * (-1.984_127e-4 + z * 2.755_732e-6)));
     let c = 1.0 + z * (-0.5 + z * (4.166_666_8e-2 + z * (-1.388_888_9e-3 + z * 2.480_158_7e-5)));
     (s, c)
+}
+
+/// The same, with all digits of f64.
+#[cfg(feature = "double")]
+fn sincos_small(x: f32) -> (f32, f32) {
+    libm::sincos(x)
 }
 
 /// `(sin 2 pi u, cos 2 pi u)` for u in [0, 1], absolute error below 2e-7.

@@ -81,6 +81,8 @@ pub(super) struct Block {
     chosen: [Option<Choice>; N],
     /// Choices since the last flush of which some lights were left out.
     fewer: u64,
+    /// Vertices without a shadow ray since the last flush.
+    unlit: u64,
     roulette: [bool; N],
     // of the light chosen
     light_p0: Lanes3,
@@ -117,6 +119,22 @@ fn set(lanes: &mut Lanes, x: f32, mask: &[u32; N]) {
     }
 }
 
+/// The same of vectors.
+#[inline(always)]
+fn set3(lanes: &mut Lanes3, v: Vec3, mask: &[u32; N]) {
+    set(&mut lanes.0[0], v.x, mask);
+    set(&mut lanes.0[1], v.y, mask);
+    set(&mut lanes.0[2], v.z, mask);
+}
+
+/// Numbers in [0, 1).
+#[inline(always)]
+fn units(lanes: &mut Lanes, raw: &[u32; N]) {
+    for i in 0..N {
+        lanes[i] = unit(raw[i]);
+    }
+}
+
 impl Default for Block {
     fn default() -> Block {
         let lanes = [0.0; N];
@@ -144,6 +162,7 @@ impl Default for Block {
             choice: [0; N],
             chosen: [None; N],
             fewer: 0,
+            unlit: 0,
             roulette: [false; N],
             light_p0: Lanes3::ZERO,
             light_e1: Lanes3::ZERO,
@@ -212,9 +231,7 @@ impl Block {
             wide::compute(self, context);
         }
         out.counters.chosen_of_fewer += std::mem::take(&mut self.fewer);
-        if context.skips.makes(Skip::Shadows) {
-            self.count_unlit(out);
-        }
+        out.counters.unlit += std::mem::take(&mut self.unlit);
         if self.passes[..self.len].contains(&true) {
             self.emit_mixed(out, plain);
         } else {
@@ -231,7 +248,11 @@ impl Block {
         self.choose_lights(context);
         self.sample_lights();
         self.other_lights(context);
-        self.shadow_rays(!context.skips.makes(Skip::Shadows));
+        let skips_unlit = context.skips.makes(Skip::Shadows);
+        self.shadow_rays(!skips_unlit);
+        if skips_unlit {
+            self.count_unlit();
+        }
         self.next_rays(context.frame.split as f32);
     }
 
@@ -263,13 +284,12 @@ impl Block {
             self.choice[i] = numbers[LIGHT_CHOICE];
             self.roulette[i] = vertex >= frame.rr_depth;
         }
-        let [d0, d1] = &mut self.direction;
-        let [p0, p1] = &mut self.place;
-        for (lanes, raw) in [d0, d1, p0, p1, &mut self.go_on].into_iter().zip(&raw) {
-            for i in 0..N {
-                lanes[i] = unit(raw[i]);
-            }
-        }
+        // written out: a loop over these would be compiled for one number at a time
+        units(&mut self.direction[0], &raw[0]);
+        units(&mut self.direction[1], &raw[1]);
+        units(&mut self.place[0], &raw[2]);
+        units(&mut self.place[1], &raw[3]);
+        units(&mut self.go_on, &raw[4]);
         self.place_bits = [raw[2], raw[3]];
     }
 
@@ -329,10 +349,12 @@ impl Block {
                 (sums[k][i], counts[k][i]) = (all[i], count[i]);
             }
         }
-        for i in 0..self.len {
-            let is_fewer = (count[i] as usize) < few.len();
-            self.fewer += u64::from(is_fewer & self.seen[i] & !self.passes[i]);
+        let (mut fewer, most) = (0u32, few.len() as u32);
+        for i in 0..N {
+            let is_fewer = count[i] < most;
+            fewer += u32::from((i < self.len) & is_fewer & self.seen[i] & !self.passes[i]);
         }
+        self.fewer = u64::from(fewer);
         let (mut begin, mut numbers) = ([0; N], [0; N]);
         for (k, light) in few.iter().enumerate() {
             let mut mask = [0; N];
@@ -356,17 +378,12 @@ impl Block {
     /// Takes a light where the mask's bits are 1.
     #[inline(always)]
     fn take(&mut self, FewTriangles { light, radiance, .. }: &FewTriangles, mask: &[u32; N]) {
-        for (lanes, v) in [
-            (&mut self.light_p0, light.p0),
-            (&mut self.light_e1, light.e1),
-            (&mut self.light_e2, light.e2),
-            (&mut self.light_normal, light.normal),
-            (&mut self.radiance, *radiance),
-        ] {
-            for (lanes, x) in lanes.0.iter_mut().zip(v.to_array()) {
-                set(lanes, x, mask);
-            }
-        }
+        // written out: of loops over vectors and their components the compiler makes gathers and scatters across these
+        set3(&mut self.light_p0, light.p0, mask);
+        set3(&mut self.light_e1, light.e1, mask);
+        set3(&mut self.light_e2, light.e2, mask);
+        set3(&mut self.light_normal, light.normal, mask);
+        set3(&mut self.radiance, *radiance, mask);
         set(&mut self.light_area, light.area, mask);
         set(&mut self.light_error, light.error, mask);
     }
@@ -473,12 +490,13 @@ impl Block {
     }
 
     /// Counts the vertices without a shadow ray; those that pass are counted where they are shaded.
-    fn count_unlit(&self, out: &mut Outcome) {
+    #[inline(always)]
+    fn count_unlit(&mut self) {
         let mut unlit = 0u32;
         for i in 0..N {
             unlit += u32::from((i < self.len) & self.seen[i] & !self.casts[i] & !self.passes[i]);
         }
-        out.counters.unlit += u64::from(unlit);
+        self.unlit = u64::from(unlit);
     }
 
     /// Appends what came of vertices none of which passes: without branches that depend on them.

@@ -1,11 +1,9 @@
 //! One vertex on a flat diffuse surface, without branches: the same lines serve one vertex and, in loops, many.
 
-use std::f32::consts::FRAC_1_PI;
-
-use glam::Vec3;
-
 use super::power_heuristic;
 use crate::math::{Basis, UnitDir, concentric_disk};
+use crate::real::consts::FRAC_1_PI;
+use crate::real::{Vec3, f32};
 
 /// What becomes of a path at a vertex.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

@@ -1,12 +1,10 @@
 //! What a hit looks like from the side it was hit from.
 
-use std::f32::consts::PI;
-
-use glam::Vec3;
-
 use super::Surface;
 use crate::math::{Basis, Position, gamma, offset_origin};
 use crate::ray::Hit;
+use crate::real::consts::PI;
+use crate::real::{Vec3, f32, narrow, wide};
 use crate::texture::At;
 use crate::world::{Primitive, interpolated as interpolated_at, sphere_uv};
 
@@ -84,12 +82,12 @@ impl Interaction {
         let Primitive::Triangle([a, b, c]) = surface.geometry else { return None };
         let p0 = Vec3::from(a);
         let (e1, e2) = (Vec3::from(b) - p0, Vec3::from(c) - p0);
-        let n = e1.as_dvec3().cross(e2.as_dvec3());
+        let n = wide(e1).cross(wide(e2));
         let length = n.length();
         if !(length > 0.0 && length.is_finite()) {
             return None;
         }
-        let front = (n / length).as_vec3();
+        let front = narrow(n / length);
         Self::facing(d, Position::on_triangle(p0, e1, e2, hit.u, hit.v), front, hit, surface)
     }
 

@@ -4,34 +4,43 @@
 //! throughput, and splitting at the first hit. What a ray becomes is a function of (frame, world, ray, hit) alone: neither the batch it is
 //! in nor its neighbours matter.
 
+#[cfg(not(feature = "double"))]
 mod block;
 mod diffuse;
 mod interaction;
+#[cfg(not(feature = "double"))]
 mod primary;
+#[cfg(not(feature = "double"))]
 pub mod reference;
 mod shade;
 #[cfg(test)]
 mod tests;
+#[cfg(not(feature = "double"))]
 mod wide;
 
 use bytemuck::{Pod, Zeroable};
-use glam::Vec3;
 
 use crate::frame::Frame;
 use crate::light::{LightSample, Lights};
 use crate::math::UnitDir;
 use crate::ray::{Hit, PathKey, PrimId, Ray};
+use crate::real::{Vec3, f32};
 use crate::sampler::Stream;
 use crate::skip::{Skip, SkipCounts, Skips};
 use crate::texture::{NoTextures, Textures};
 use crate::world::{Primitive, World};
 
+#[cfg(not(feature = "double"))]
 pub use primary::camera_rays;
+#[cfg(feature = "double")]
+pub use shade::shade_plain as shade;
+#[cfg(not(feature = "double"))]
 pub use shade::{shade, shade_traced};
 
 /// A ray looking for the nearest hit, with what its path needs to go on. 48 bytes.
 #[repr(C)]
-#[derive(Clone, Copy, Debug, PartialEq, Pod, Zeroable)]
+#[derive(Clone, Copy, Debug, PartialEq)]
+#[cfg_attr(not(feature = "double"), derive(Pod, Zeroable))]
 pub struct PathRay {
     /// Origin, in recentred coordinates, already off the surface it left.
     pub o: [f32; 3],
@@ -47,7 +56,8 @@ pub struct PathRay {
 
 /// A ray that only asks whether something is in the way. 48 bytes.
 #[repr(C)]
-#[derive(Clone, Copy, Debug, PartialEq, Pod, Zeroable)]
+#[derive(Clone, Copy, Debug, PartialEq)]
+#[cfg_attr(not(feature = "double"), derive(Pod, Zeroable))]
 pub struct ShadowRay {
     /// Origin, in recentred coordinates, already off the surface it left.
     pub o: [f32; 3],
@@ -189,7 +199,9 @@ pub struct Outcome {
     /// What happened.
     pub counters: Counters,
     /// Memory that `shade` keeps between calls.
+    #[cfg(not(feature = "double"))]
     block: Option<Box<block::Block>>,
+    #[cfg(not(feature = "double"))]
     rays: Vec<Ray>,
 }
 

@@ -1,7 +1,6 @@
 //! Shading of a batch.
 
-use glam::Vec3;
-
+#[cfg(not(feature = "double"))]
 use super::block::{Block, FlatDiffuse};
 use super::diffuse::{Fate, cosine_direction, onwards, snap, towards_light};
 use super::interaction::{Interaction, triangle_place};
@@ -9,10 +8,12 @@ use super::{Context, Contribution, Outcome, PathRay, ShadowRay, Surface, Surface
 use crate::material::{Blend, Bsdf, Detail, Material, Relief, ReliefKind};
 use crate::math::{UnitDir, unit};
 use crate::ray::{Hit, PathKey, Ray};
+use crate::real::{Vec3, f32};
 use crate::sampler::{BSDF, LIGHT, LIGHT_CHOICE, LOBE, ROULETTE, Stream};
 use crate::skip::Skip;
 use crate::world::{Primitive, ShapeInfo};
 
+#[cfg(not(feature = "double"))]
 /// Shades each ray with its hit and appends what comes of it to `out`.
 ///
 /// `rays` and `hits` are of one length. A ray that missed brings the sky. A hit brings what the surface emits, and unless the path ends there (depth,
@@ -28,6 +29,7 @@ pub fn shade<S: Surfaces>(context: &Context, surfaces: &S, rays: &[PathRay], hit
     out.rays = traced;
 }
 
+#[cfg(not(feature = "double"))]
 /// [`shade`] where the rays are at hand as they were traced: `traced[i]` is `rays[i].ray()` but for its `tmax`.
 pub fn shade_traced<S: Surfaces>(
     context: &Context,
@@ -113,15 +115,9 @@ fn foresee_texels<S: Surfaces>(context: &Context, surfaces: &S, index: usize, ra
     }
 }
 
-/// The plain twin of [`shade`]: one vertex after the other.
-#[cfg(test)]
-pub(super) fn shade_plain<S: Surfaces>(
-    context: &Context,
-    surfaces: &S,
-    rays: &[PathRay],
-    hits: &[Hit],
-    out: &mut Outcome,
-) {
+/// The plain twin of `shade`: one vertex after the other.
+#[cfg(any(test, feature = "double"))]
+pub fn shade_plain<S: Surfaces>(context: &Context, surfaces: &S, rays: &[PathRay], hits: &[Hit], out: &mut Outcome) {
     for (index, (ray, hit)) in rays.iter().zip(hits).enumerate() {
         out.counters.shaded += 1;
         if !hit.is_hit() {
@@ -142,6 +138,7 @@ pub(super) fn shade_plain<S: Surfaces>(
     }
 }
 
+#[cfg(not(feature = "double"))]
 fn flush<S: Surfaces>(
     context: &Context,
     surfaces: &S,
@@ -187,6 +184,7 @@ struct Leaving<'a> {
     throughput: Vec3,
 }
 
+#[cfg(not(feature = "double"))]
 /// A hit of a flat triangle whose albedo alone is a texture's.
 #[inline(never)]
 fn painted<S: Surfaces>(

@@ -1,6 +1,5 @@
 //! Images.
 
-use glam::Vec3;
 use serde::{Deserialize, Serialize};
 
 use super::UvMap;
@@ -8,6 +7,7 @@ use super::texel::Texel;
 use super::tiles::{TILE, Textures};
 use crate::math::luminance;
 use crate::memory::prefetch;
+use crate::real::{Vec3, f32};
 
 /// What is beyond the image.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]

@@ -1,9 +1,9 @@
 //! Squares of two colours.
 
-use glam::Vec3;
 use serde::{Deserialize, Serialize};
 
 use super::UvMap;
+use crate::real::{Vec3, f32};
 
 /// Four squares in the unit square of the mapped coordinates, repeated.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]

@@ -11,10 +11,10 @@ mod tests;
 mod texel;
 mod tiles;
 
-use glam::Vec3;
 use serde::{Deserialize, Serialize};
 
 use crate::math::luminance;
+use crate::real::{Vec3, f32};
 
 pub use bitmap::{Bitmap, Filter, Wrap};
 pub use checkerboard::Checkerboard;

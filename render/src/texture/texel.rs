@@ -2,8 +2,9 @@
 
 use std::sync::LazyLock;
 
-use glam::Vec3;
 use serde::{Deserialize, Serialize};
+
+use crate::real::{Stored, Vec3, f32, real};
 
 /// Format of one channel of a texel.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -41,7 +42,7 @@ impl Texel {
             Texel::Linear8 => f32::from(bytes[at + k]) / 255.0,
             Texel::Float => {
                 let at = at + 4 * k;
-                f32::from_le_bytes([bytes[at], bytes[at + 1], bytes[at + 2], bytes[at + 3]])
+                real(Stored::from_le_bytes([bytes[at], bytes[at + 1], bytes[at + 2], bytes[at + 3]]))
             }
         };
         if channels == 1 { Vec3::splat(number(0)) } else { Vec3::new(number(0), number(1), number(2)) }

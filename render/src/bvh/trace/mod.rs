@@ -3,12 +3,12 @@
 mod scalar;
 mod setup;
 mod sphere;
-#[cfg(target_arch = "x86_64")]
+#[cfg(all(target_arch = "x86_64", not(feature = "double")))]
 mod start;
 mod triangle;
-#[cfg(target_arch = "x86_64")]
+#[cfg(all(target_arch = "x86_64", not(feature = "double")))]
 mod vector;
-#[cfg(target_arch = "x86_64")]
+#[cfg(all(target_arch = "x86_64", not(feature = "double")))]
 mod wide;
 
 pub(super) use scalar::read_triangle;
@@ -17,6 +17,7 @@ use setup::State;
 use super::forest::Forest;
 use super::order::Sorter;
 use crate::ray::{Hit, MISS, Ray};
+use crate::real::{f32, real};
 
 /// Which code traces. All give the same bits.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -54,7 +55,7 @@ pub struct Tracer {
     counters: Counters,
     stack: scalar::Stack,
     sorter: Option<Sorter>,
-    #[cfg(target_arch = "x86_64")]
+    #[cfg(all(target_arch = "x86_64", not(feature = "double")))]
     lanes: wide::Lanes,
 }
 
@@ -74,7 +75,7 @@ impl Tracer {
             counters: Counters::default(),
             stack: Vec::new(),
             sorter: None,
-            #[cfg(target_arch = "x86_64")]
+            #[cfg(all(target_arch = "x86_64", not(feature = "double")))]
             lanes: wide::Lanes::default(),
         })
     }
@@ -141,7 +142,7 @@ impl Tracer {
             _ => &[],
         };
         match kernel {
-            #[cfg(target_arch = "x86_64")]
+            #[cfg(all(target_arch = "x86_64", not(feature = "double")))]
             Kernel::Avx2 | Kernel::Avx512 => {
                 let (kernel, mut of_spheres) = (*kernel, Counters::default());
                 let mut finish = |i: usize, state: &mut State| {
@@ -157,7 +158,7 @@ impl Tracer {
             _ => {
                 for k in 0..rays.len() {
                     let i = order.get(k).map_or(k, |&i| i as usize);
-                    let mut state = State::new(&rays[i], forest.largest());
+                    let mut state = State::new(&rays[i], real(forest.largest()));
                     scalar::triangles(forest, &mut state, ANY, stack, counters);
                     if let Some(root) = asks(&state) {
                         let enter = scalar::enter_children;
@@ -177,7 +178,7 @@ const MAX_BATCH: usize = 1 << 24;
 fn runs(kernel: Kernel) -> bool {
     match kernel {
         Kernel::Auto | Kernel::Scalar => true,
-        #[cfg(target_arch = "x86_64")]
+        #[cfg(all(target_arch = "x86_64", not(feature = "double")))]
         Kernel::Avx2 => {
             is_x86_feature_detected!("avx2")
                 && is_x86_feature_detected!("fma")
@@ -186,7 +187,7 @@ fn runs(kernel: Kernel) -> bool {
                 && is_x86_feature_detected!("lzcnt")
                 && is_x86_feature_detected!("popcnt")
         }
-        #[cfg(target_arch = "x86_64")]
+        #[cfg(all(target_arch = "x86_64", not(feature = "double")))]
         Kernel::Avx512 => {
             runs(Kernel::Avx2)
                 && is_x86_feature_detected!("avx512f")
@@ -194,7 +195,7 @@ fn runs(kernel: Kernel) -> bool {
                 && is_x86_feature_detected!("avx512dq")
                 && is_x86_feature_detected!("avx512bw")
         }
-        #[cfg(not(target_arch = "x86_64"))]
+        #[cfg(any(not(target_arch = "x86_64"), feature = "double"))]
         Kernel::Avx2 | Kernel::Avx512 => false,
     }
 }

@@ -7,6 +7,7 @@ use super::setup::State;
 use super::triangle::{Intersection, intersect};
 use super::{Counters, accept, sphere};
 use crate::ray::{MISS, Ray};
+use crate::real::{f32, real};
 
 /// Entry distance and reference of what is still to be visited.
 pub(super) type Stack = Vec<(f32, u32)>;
@@ -42,7 +43,7 @@ pub(super) fn spheres(
         let (at, n) = (offset(leaf), leaf_len(leaf));
         for i in 0..n {
             let s = read_sphere(arena, at, n, i);
-            if let Some(t) = sphere::intersect(ray, state.tmin, state.tmax, s.center, s.radius) {
+            if let Some(t) = sphere::intersect(ray, state.tmin, state.tmax, s.center.map(real), real(s.radius)) {
                 accept(forest, state, t, [0.0; 2], read_u32(arena, at + (INDEX_ROW * n + i) * 4), leaf, i as u32);
             }
         }
@@ -101,6 +102,7 @@ fn enter(state: &State, aabb: &Aabb) -> Option<f32> {
     for axis in 0..3 {
         let is_negative = state.near_row[axis] & 32 != 0;
         let (entry, exit) = if is_negative { (aabb.hi[axis], aabb.lo[axis]) } else { (aabb.lo[axis], aabb.hi[axis]) };
+        let (entry, exit) = (real(entry), real(exit));
         first = first.max(entry.mul_add(inverse[axis], -near[axis]));
         last = last.min(exit.mul_add(inverse[axis], -far[axis]));
     }
@@ -111,6 +113,6 @@ fn enter(state: &State, aabb: &Aabb) -> Option<f32> {
 #[inline(always)]
 pub(in super::super) fn read_triangle(arena: &[u8], leaf: usize, n: usize, i: usize) -> [[f32; 3]; 3] {
     // written out: closures over arrays become calls
-    let at = |row: usize| read_f32(arena, leaf + (row * n + i) * 4);
+    let at = |row: usize| real(read_f32(arena, leaf + (row * n + i) * 4));
     [[at(0), at(1), at(2)], [at(3), at(4), at(5)], [at(6), at(7), at(8)]]
 }

@@ -47,10 +47,9 @@
 //!
 //! Spheres are tested in f64 ([`super::sphere`]); what (1) and (3) are for them is derived there, and is smaller.
 
-use glam::Vec4;
-
 use super::super::layout::MAX_COORDINATE;
 use crate::ray::{MISS, Ray};
+use crate::real::{Vec4, f32, real};
 
 /// Smallest and largest magnitude of a direction's largest component: 2^-30 and 2^30.
 pub(super) const DIRECTION_RANGE: (f32, f32) = (1.0 / (1 << 30) as f32, (1 << 30) as f32);
@@ -135,7 +134,7 @@ impl State {
         let (far, size) = (o.abs(), d.abs());
         let (reach, steepest) = (far.max_element(), size.max_element());
         // NaN makes every comparison false
-        let is_sane = far.cmple(Vec4::splat(MAX_COORDINATE)).all()
+        let is_sane = far.cmple(Vec4::splat(real(MAX_COORDINATE))).all()
             && size.cmple(Vec4::splat(DIRECTION_RANGE.1)).all()
             && steepest >= DIRECTION_RANGE.0
             && !(ray.tmin.is_nan() || ray.tmax.is_nan());

@@ -12,6 +12,7 @@
 //! what [`super::setup`] allows for triangles, so boxes around spheres are conservative too.
 
 use crate::ray::Ray;
+use crate::real::f32;
 
 /// Nearest `t` with `tmin < t <= tmax` at which the ray meets the sphere, from inside or outside.
 #[inline(always)]

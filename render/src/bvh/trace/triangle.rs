@@ -10,6 +10,7 @@
 //! The bounds on t and the barycentrics are derived in [`super::setup`].
 
 use super::setup::State;
+use crate::real::f32;
 
 /// What a ray and a triangle have in common.
 #[derive(Clone, Copy, Debug, PartialEq)]

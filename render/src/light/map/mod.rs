@@ -12,12 +12,10 @@
 #[cfg(test)]
 mod tests;
 
-use std::f32::consts::PI;
-
-use glam::Vec3;
-
 use crate::math::{UnitDir, luminance, sincos_turn};
 use crate::memory::{prefetch, spacious};
+use crate::real::consts::PI;
+use crate::real::{Stored, Vec3, atan2, f32, real, stored};
 
 /// All numbers that choose.
 const WHOLE: u32 = 1 << 31;
@@ -181,8 +179,8 @@ impl SkyMap {
     /// The patch that a direction lies in: a function of the direction alone, so that a direction has one density whoever asks.
     #[inline]
     fn place(&self, d: Vec3) -> Place {
-        let u = libm::atan2f(d.x, -d.z) * (0.5 / PI);
-        let v = libm::atan2f((d.x * d.x + d.z * d.z).sqrt(), d.y) * (1.0 / PI);
+        let u = atan2(d.x, -d.z) * (0.5 / PI);
+        let v = atan2((d.x * d.x + d.z * d.z).sqrt(), d.y) * (1.0 / PI);
         let width = self.width as f32;
         let at = u * width - 0.5;
         let at = if at < 0.0 { at + width } else { at };
@@ -219,7 +217,7 @@ impl SkyMap {
         out.extend(MAGIC);
         out.extend(self.width.to_le_bytes());
         out.extend(self.height.to_le_bytes());
-        out.extend(self.texels.iter().flatten().flat_map(|v| v.to_le_bytes()));
+        out.extend(self.texels.iter().flatten().flat_map(|v| stored(*v).to_le_bytes()));
         out
     }
 
@@ -234,7 +232,7 @@ impl SkyMap {
         if bytes[..8] != MAGIC || texels.checked_mul(12) != Some((bytes.len() - HEAD) as u64) {
             return Err(SkyMapError::Format);
         }
-        let value = |b: &[u8]| f32::from_le_bytes([b[0], b[1], b[2], b[3]]);
+        let value = |b: &[u8]| real(Stored::from_le_bytes([b[0], b[1], b[2], b[3]]));
         let mut all = spacious(texels as usize);
         all.extend(bytes[HEAD..].chunks_exact(12).map(|t| [value(&t[..4]), value(&t[4..8]), value(&t[8..])]));
         SkyMap::new(width, height, all)
