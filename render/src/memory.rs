@@ -25,7 +25,7 @@ pub(crate) const HUGE_FROM: usize = 8 << 20;
 pub(crate) fn spacious<T>(count: usize) -> Vec<T> {
     let mut values = Vec::with_capacity(count);
     let room: &mut [std::mem::MaybeUninit<T>] = values.spare_capacity_mut();
-    let bytes = std::mem::size_of_val(room);
+    let bytes = size_of_val(room);
     #[cfg(target_os = "linux")]
     if bytes >= HUGE_FROM {
         let start = room.as_mut_ptr().cast::<u8>();
