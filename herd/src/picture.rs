@@ -17,7 +17,7 @@ use crate::job::{Image, JobError};
 /// One, because the exr crate writes attributes in the order of a hash map, which differs from run to run.
 pub const ATTRIBUTE: &str = "rayherd";
 
-/// Encodes `picture` with `definition` in its header: [`write`] into memory.
+/// Encodes `picture` with `definition` in its header: [`write()`] into memory.
 ///
 /// # Errors
 /// When the definition does not fit a header.
