@@ -48,6 +48,9 @@ pub struct GroupRef {
 pub struct FilmRef {
     /// Its object.
     pub key: String,
+    /// The band of tiles that it has something of ([`crate::remote::bands`]); of any tiles without one.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub band: Option<u32>,
     /// Size of the object.
     pub bytes: u64,
     /// Nodes that hold a copy.
@@ -68,8 +71,9 @@ pub struct Inputs {
 pub struct Outputs {
     /// Rays that left.
     pub groups: Vec<GroupRef>,
-    /// What it added to the film, if anything.
-    pub film: Option<FilmRef>,
+    /// What it added to the film, if anything: one part for each band that it touched.
+    #[serde(with = "film_refs", default)]
+    pub film: Vec<FilmRef>,
     /// Rays traced.
     pub rays: RayCounts,
     /// Contributions that were not finite or too large.
@@ -100,8 +104,9 @@ pub struct Record {
 /// The state of a ledger, but for running tasks.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Snapshot {
-    /// Sum of all committed film parts; none if there were none.
-    pub film: Option<FilmRef>,
+    /// Parts whose sum is that of all committed ones; none if there were none.
+    #[serde(with = "film_refs", default)]
+    pub film: Vec<FilmRef>,
     /// Groups that wait.
     pub waiting: Vec<GroupRef>,
     /// Samples whose camera rays were made.
@@ -307,7 +312,7 @@ impl Ledger {
     }
 
     /// The state as it is, with the film of all commits; what running tasks hold waits in it.
-    pub fn snapshot(&self, film: Option<FilmRef>) -> Snapshot {
+    pub fn snapshot(&self, film: Vec<FilmRef>) -> Snapshot {
         let held = self.running.values().flat_map(|t| &t.inputs);
         let mut waiting: Vec<GroupRef> = self.waiting.values().chain(held).cloned().collect();
         waiting.sort_by(|a, b| a.key.cmp(&b.key));
@@ -406,6 +411,36 @@ impl Ledger {
         self.commits += 1;
         self.sequence += 1;
         self.head = name;
+    }
+}
+
+/// One part is written as itself and none as null, as when there was one at most; so records of small films are the same in all versions.
+mod film_refs {
+    use serde::{Deserialize, Deserializer, Serialize, Serializer};
+
+    use super::FilmRef;
+
+    #[derive(Deserialize)]
+    #[serde(untagged)]
+    enum Either {
+        Many(Vec<FilmRef>),
+        One(FilmRef),
+    }
+
+    pub fn serialize<S: Serializer>(film: &Vec<FilmRef>, to: S) -> Result<S::Ok, S::Error> {
+        match film.as_slice() {
+            [] => to.serialize_none(),
+            [one] => one.serialize(to),
+            many => many.serialize(to),
+        }
+    }
+
+    pub fn deserialize<'de, D: Deserializer<'de>>(from: D) -> Result<Vec<FilmRef>, D::Error> {
+        Ok(match Option::<Either>::deserialize(from)? {
+            None => Vec::new(),
+            Some(Either::One(one)) => vec![one],
+            Some(Either::Many(many)) => many,
+        })
     }
 }
 

@@ -93,6 +93,8 @@ async fn run() -> anyhow::Result<()> {
     let tls = tasks::open(&context).await?;
     let tasks = tokio::spawn(tasks::serve(context.clone(), tls));
     leads(&context, true).await?;
+    let left = context.left.clone();
+    tokio::spawn(async move { left.keep().await });
     context.metrics.leader.set(1);
 
     let watch = || watcher::Config::default().timeout(WATCH_SECONDS);

@@ -264,6 +264,9 @@ mod tests {
             }
         }
         assert!(count > 18, "{count}");
+        // else Prometheus puts its own labels of these names in the place of ours, and no alert names its job
+        let template = format!("{folder}/../templates/monitoring.yaml");
+        assert!(std::fs::read_to_string(template).unwrap().contains("honorLabels: true"));
     }
 
     #[test]

@@ -24,7 +24,7 @@ use serde_json::json;
 
 use crate::build;
 use crate::config::Config;
-use crate::finish;
+use crate::finish::{self, Leftovers};
 use crate::jobs::{Jobs, Running};
 use crate::metrics::Metrics;
 use crate::run;
@@ -58,6 +58,8 @@ pub struct Context {
     pub trusted: RwLock<String>,
     /// Who prepares which scene.
     pub turns: Arc<Turns>,
+    /// What is left of deleted jobs in storages whose servers were away.
+    pub left: Arc<Leftovers>,
     /// What a person would want to know.
     pub events: Recorder,
     /// Counts.
@@ -70,10 +72,10 @@ impl Context {
     /// # Errors
     /// When a metric cannot be registered, which a test excludes.
     pub fn new(client: Client, config: Config) -> anyhow::Result<Self> {
-        let (jobs, trusted, turns) = (Jobs::default(), RwLock::default(), Arc::default());
+        let (jobs, trusted, turns, left) = (Jobs::default(), RwLock::default(), Arc::default(), Arc::default());
         let reporter = Reporter { controller: "rayherd-operator".into(), instance: Some(config.pod.clone()) };
         let events = Recorder::new(client.clone(), reporter);
-        Ok(Context { client, config, jobs, trusted, turns, events, metrics: Metrics::new()? })
+        Ok(Context { client, config, jobs, trusted, turns, left, events, metrics: Metrics::new()? })
     }
     /// Objects of every namespace that is watched.
     pub fn everywhere<K>(&self) -> Api<K>
@@ -339,6 +341,9 @@ async fn start(
         jobs.get(&job.name_any()).await.map_err(api("read the job"))?
     };
     let job = Arc::new(job);
+    // an earlier operator may have left something there
+    let (left, of_task) = (context.left.clone(), depot.clone());
+    tokio::spawn(async move { left.find(&of_task).await });
     let running = run::start(context.client.clone(), job, storage, depot, context.turns.clone(), before);
     context.jobs.insert(uid, running.clone());
     context.metrics.started.inc();
@@ -511,7 +516,8 @@ async fn delete(job: &RenderJobObject, context: &Context, jobs: &Api<Seen>, uid:
     }
     match depot(context, job, &namespace).await {
         Ok((_, depot)) => match finish::clean(&depot, uid).await {
-            Ok(()) => {}
+            Ok(true) => {}
+            Ok(false) => context.left.add(uid, depot),
             // keys that may not read or delete have written nothing, as a rule; the job must not stay for that either
             Err(e @ StoreError::Denied { .. }) => {
                 tracing::warn!(job = %job.name_any(), "objects of the deleted job may be left in its storage: {e}");

@@ -10,6 +10,7 @@ use rayherd_api::ByteSize;
 use rayherd_api::resource::RenderJobObject;
 use rayherd_herd::job::spec::scene_settings;
 use rayherd_herd::job::{JobError, Progress, Status};
+use rayherd_herd::remote::bands::BAND;
 use rayherd_herd::remote::frames::{Job, Keeper, run};
 use rayherd_herd::remote::{Depot, Fleet, Storage, Turns};
 use rayherd_herd::report::Report;
@@ -93,6 +94,7 @@ pub fn start(
             fleet: &of_thread.fleet,
             turns: &turns,
             slots,
+            band: BAND,
             runtime,
         };
         let keeper: Arc<dyn Keeper> = Arc::new(keeper);

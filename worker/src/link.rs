@@ -89,6 +89,7 @@ impl Link for Http {
 mod tests {
     use std::io::{Read, Write};
     use std::net::TcpListener;
+    use std::path::Path;
 
     use rayherd_herd::remote::{Storage, WorkerId};
     use rayherd_herd::store::S3Credentials;
@@ -127,9 +128,7 @@ mod tests {
         (root, port)
     }
 
-    fn config(operator: String, authority: String) -> Config {
-        let token = std::env::temp_dir().join(format!("rayherd-token-{}", std::process::id()));
-        fs::write(&token, "secret").unwrap();
+    fn config(operator: String, authority: String, token: &Path) -> Config {
         Config {
             operator,
             job: "uid".into(),
@@ -139,7 +138,7 @@ mod tests {
             storage: Storage { bucket: "b".into(), prefix: String::new(), region: "r".into(), endpoints: vec![] },
             credentials: S3Credentials { access_key: String::new(), secret_key: String::new(), session_token: None },
             scratch: "/".into(),
-            token,
+            token: token.to_owned(),
             authority,
         }
     }
@@ -147,13 +146,17 @@ mod tests {
     #[test]
     fn only_the_operator_of_our_authority_is_told_anything() {
         let ((ours, port), (others, _)) = (serve(), serve());
+        let mut token = tempfile::NamedTempFile::new().unwrap();
+        token.write_all(b"secret").unwrap();
+        let token = token.path();
         let beat = Beat { worker: WorkerId { number: 0, session: "s".into() }, running: vec![] };
-        let to = |authority: &str| Http::new(&config(format!("https://localhost:{port}"), authority.into())).unwrap();
+        let to =
+            |authority: &str| Http::new(&config(format!("https://localhost:{port}"), authority.into(), token)).unwrap();
         assert_eq!(to(&ours).beat(&beat).unwrap(), Vec::<String>::new());
         assert_eq!(to(&format!("{others}{ours}")).beat(&beat).unwrap(), Vec::<String>::new(), "while roots change");
         let error = to(&others).beat(&beat).unwrap_err().to_string();
         assert!(error.contains("certificate"), "{error}");
-        assert!(Http::new(&config(format!("http://localhost:{port}"), ours)).is_err(), "never without TLS");
-        assert!(Http::new(&config(format!("https://localhost:{port}"), "nothing".into())).is_err());
+        assert!(Http::new(&config(format!("http://localhost:{port}"), ours, token)).is_err(), "never without TLS");
+        assert!(Http::new(&config(format!("https://localhost:{port}"), "nothing".into(), token)).is_err());
     }
 }

@@ -1,10 +1,11 @@
 //! From what an attempt reports to what counts.
 
+use std::collections::BTreeSet;
 use std::time::{Duration, Instant};
 
 use super::{Driver, FilmSum, Finished, Objects};
 use crate::job::JobError;
-use crate::ledger::{Record, Refused, TaskId, record_key};
+use crate::ledger::{FilmRef, Record, Refused, TaskId, record_key};
 use crate::local::attempt::Made;
 use crate::local::journal;
 
@@ -65,7 +66,7 @@ impl<F: FilmSum> Driver<'_, '_, F> {
             Err(e) => return Err(e.into()),
         };
         if settled && !record.made.groups.is_empty() {
-            self.settled = self.ledger.snapshot(None);
+            self.settled = self.ledger.snapshot(Vec::new());
             self.film.settle();
         }
         let name = self.write(&record)?;
@@ -80,12 +81,11 @@ impl<F: FilmSum> Driver<'_, '_, F> {
         self.hops += made.hops;
         self.skipped += &made.skipped;
         self.hop_bytes += bytes;
-        if let Some(film) = record.made.film {
-            if self.is_durable() {
-                self.superfluous[1].push((film.key, film.holders));
-            } else {
-                self.shared.nodes.delete(&[(film.key, film.holders)])?;
-            }
+        let film = record.made.film.into_iter().map(|f| (f.key, f.holders));
+        if self.is_durable() {
+            self.superfluous[1].extend(film);
+        } else {
+            self.shared.nodes.delete(&film.collect::<Objects>())?;
         }
         if let Some(running) = self.running.remove(&task) {
             self.live.iter().filter(|(k, _)| k.0 == task).for_each(|(_, l)| l.stop.set());
@@ -143,14 +143,26 @@ impl<F: FilmSum> Driver<'_, '_, F> {
         let [old_records, new_records] = std::mem::take(&mut self.old_records);
         let name = self.write(&record)?;
         self.ledger.follow_snapshot(&record, name)?;
-        let (needed, old): (Objects, Objects) = old.into_iter().partition(|(name, _)| self.film.needs(name));
+        // the snapshot before this one must stay readable: what it names may have been added up since
+        let stays = |name: &String| self.film.needs(name) || self.named.contains(name);
+        let (needed, old): (Objects, Objects) = old.into_iter().partition(|(name, _)| stays(name));
         new.extend(needed);
         let nodes = &self.shared.nodes;
         nodes.delete(&old)?;
         nodes.wait(nodes.store().delete(&old_records))?;
-        self.superfluous = [new, film.into_iter().map(|f| (f.key, f.holders)).collect()];
+        self.named.clear();
+        self.superfluous = [new, Vec::new()];
+        self.note_stored(film);
         self.old_records[0] = new_records;
         Ok(())
+    }
+
+    /// A snapshot names these parts: they go when they are needed no more, but not before the next snapshot but one.
+    pub(super) fn note_stored(&mut self, film: Vec<FilmRef>) {
+        let known: BTreeSet<&String> = self.superfluous.iter().flatten().map(|(name, _)| name).collect();
+        let (old, new): (Vec<FilmRef>, Vec<FilmRef>) = film.into_iter().partition(|f| known.contains(&f.key));
+        self.named.extend(old.into_iter().chain(new.iter().cloned()).map(|f| f.key));
+        self.superfluous[1].extend(new.into_iter().map(|f| (f.key, f.holders)));
     }
 
     /// A name that no film of this run has.

@@ -94,11 +94,12 @@ pub trait FilmSum {
     fn settle(&mut self);
     /// Goes back to what was kept.
     fn go_back(&mut self);
-    /// Stores the sum as one object of this name; none when it is empty.
+    /// Stores the sum in objects whose names begin so, as far as it is not stored yet; where all of it lies then: nowhere when it is
+    /// empty.
     ///
     /// # Errors
     /// When it cannot be stored.
-    fn store(&mut self, name: &str) -> Result<Option<FilmRef>, JobError>;
+    fn store(&mut self, name: &str) -> Result<Vec<FilmRef>, JobError>;
     /// Estimated relMSE of so many samples per pixel, if there are two.
     ///
     /// # Errors

@@ -14,7 +14,8 @@ impl<F: FilmSum> Driver<'_, '_, F> {
     /// [`Report::tasks_redone`]: crate::report::Report::tasks_redone
     pub(crate) fn go_back(&mut self, why: &JobError) -> Result<(), JobError> {
         tracing::warn!("{why}; what was committed since no ray was on its way is computed again");
-        let before: Objects = self.ledger.snapshot(None).waiting.into_iter().map(|g| (g.key, g.holders)).collect();
+        let before: Objects =
+            self.ledger.snapshot(Vec::new()).waiting.into_iter().map(|g| (g.key, g.holders)).collect();
         let mut snapshot = self.settled.clone();
         self.film.go_back();
         self.redone += self.ledger.commits() - snapshot.commits;
@@ -22,9 +23,11 @@ impl<F: FilmSum> Driver<'_, '_, F> {
             let key = self.film_name();
             snapshot.film = self.film.store(&key)?;
         }
+        let film = snapshot.film.clone();
         let record = self.ledger.record_of(snapshot);
         let name = self.write(&record)?;
         self.ledger.go_back(&record, name)?;
+        self.note_stored(film);
         self.stop_all();
         self.running.clear();
         self.cameras.clear();
@@ -37,7 +40,7 @@ impl<F: FilmSum> Driver<'_, '_, F> {
         let nodes = &self.shared.nodes;
         self.forget(node);
         self.live.values().filter(|l| l.node == node).for_each(|l| l.stop.set());
-        for group in self.ledger.snapshot(None).waiting {
+        for group in self.ledger.snapshot(Vec::new()).waiting {
             if group.holders.contains(&node) {
                 let holders = nodes.copy_again(Kind::Rays, &group.key, &group.holders, node)?;
                 self.ledger.relocate(&group.key, holders);
@@ -52,7 +55,7 @@ impl<F: FilmSum> Driver<'_, '_, F> {
 
     /// A store is silent. What lay on it is copied again from where else it lies, so that another loss costs no work.
     pub(super) fn lose_copies(&mut self, executor: &dyn Executor, store: u32) -> Result<(), JobError> {
-        let waiting = self.ledger.snapshot(None).waiting;
+        let waiting = self.ledger.snapshot(Vec::new()).waiting;
         let groups = waiting.into_iter().filter(|g| g.holders.contains(&store)).map(|g| (g.key, g.holders));
         let objects: Objects = groups.chain(self.film.on_store(store)).collect();
         let (lay, copies) = (objects.len(), self.shared.settings.replicas as usize);

@@ -94,6 +94,8 @@ pub struct Driver<'s, 'a, F> {
     settled: Snapshot,
     /// Objects that the last snapshot made superfluous, and those that the next one will.
     superfluous: [Objects; 2],
+    /// Film that the last snapshot names, and those to which the job went back since.
+    named: BTreeSet<String>,
     old_records: [Vec<String>; 2],
     rate: Rate,
     /// Rays of earlier runs.
@@ -148,6 +150,7 @@ impl<'s, 'a, F: FilmSum> Driver<'s, 'a, F> {
             reported: BTreeSet::new(),
             committed: BTreeSet::new(),
             superfluous: Default::default(),
+            named: BTreeSet::new(),
             old_records: Default::default(),
             rate: Rate::UNKNOWN,
             start: Instant::now(),

@@ -36,7 +36,7 @@ impl Scope {
             return Err("it consumes a ray group twice".into());
         }
         let takes = !taken.is_empty() || !record.took.camera.is_empty();
-        let makes = !record.made.groups.is_empty() || record.made.film.is_some();
+        let makes = !record.made.groups.is_empty() || !record.made.film.is_empty();
         match &record.snapshot {
             Some(_) if takes || makes => return Err("it is a snapshot, and consumes or makes something as well".into()),
             Some(snapshot) => return self.check_snapshot(record, snapshot),
@@ -82,7 +82,7 @@ impl Scope {
         let camera = self.pixels.as_ref().map_or(0, |p| camera_rays(&snapshot.done, p));
         self.check_counts(&snapshot.rays, camera)?;
         self.check_groups(&snapshot.waiting)?;
-        if snapshot.done.reach() == 0 && (snapshot.film.is_some() || !snapshot.waiting.is_empty()) {
+        if snapshot.done.reach() == 0 && (!snapshot.film.is_empty() || !snapshot.waiting.is_empty()) {
             return Err("it has rays or film, and no sample was made".into());
         }
         snapshot.film.iter().try_for_each(check_film)

@@ -147,7 +147,7 @@ proptest! {
                             records.push((name, record));
                             prop_assert!(finished.insert(id));
                             if ledger.sequence % 4 == 3 {
-                                let record = ledger.record_of(ledger.snapshot(None));
+                                let record = ledger.record_of(ledger.snapshot(Vec::new()));
                                 let name = format!("r{}", record.sequence);
                                 ledger.follow_snapshot(&record, name.clone()).unwrap();
                                 records.push((name, record));
@@ -201,7 +201,7 @@ proptest! {
 fn going_back_gives_up_what_came_after() {
     let mut ledger = Ledger::new("image", 1);
     let (id, _) = ledger.start(&camera(&[unit(0, 0, 1)])).unwrap();
-    let before = ledger.snapshot(None);
+    let before = ledger.snapshot(Vec::new());
     assert!(ledger.is_settled());
     commit(&mut ledger, id, Outputs { groups: vec![group("a", 0, 5)], ..Outputs::default() });
     assert!(!ledger.is_settled() && ledger.relocate("a", vec![3]) && !ledger.relocate("b", vec![]));
@@ -220,17 +220,17 @@ fn chain() -> (Scope, Vec<(String, Record)>) {
     let mut ledger = Ledger::new("image", 2);
     let mut records = Vec::new();
     let rays = |camera: u64| RayCounts { camera, closest: 2 * camera + 7, shadow: 3, merged: 0 };
-    let film = |key: &str| FilmRef { key: key.into(), bytes: 10, holders: vec![0, 1] };
+    let film = |key: &str| FilmRef { key: key.into(), band: None, bytes: 10, holders: vec![0, 1] };
     let group = |key: &str, to| GroupRef { key: key.into(), ..group("", to, 7) };
     let (id, _) = ledger.start(&camera(&[unit(0, 0, 2), unit(1, 0, 1)])).unwrap();
     let groups = vec![group("rays/cut-a", 3), group("rays/cut-b", 7)];
-    let made = Outputs { groups, film: Some(film("film/a")), rays: rays(250), non_finite: 1 };
+    let made = Outputs { groups, film: vec![film("film/a")], rays: rays(250), non_finite: 1 };
     records.push(commit(&mut ledger, id, made));
-    let record = ledger.record_of(ledger.snapshot(Some(film("film/s"))));
+    let record = ledger.record_of(ledger.snapshot(vec![film("film/s")]));
     ledger.follow_snapshot(&record, "s".into()).unwrap();
     records.push(("s".into(), record));
     let (id, _) = ledger.start(&Inputs { groups: vec!["rays/cut-a".into()], camera: vec![unit(0, 2, 3)] }).unwrap();
-    let made = Outputs { groups: vec![group("rays/cut-c", 0)], film: None, rays: rays(100), non_finite: 0 };
+    let made = Outputs { groups: vec![group("rays/cut-c", 0)], film: vec![], rays: rays(100), non_finite: 0 };
     records.push(commit(&mut ledger, id, made));
     (scope, records)
 }
@@ -265,7 +265,7 @@ fn a_record_that_cannot_be_is_named_and_refused() {
         (0, "0 rays", |r| r.made.groups[0].rays = 0),
         (0, "0 bytes", |r| r.made.groups[0].bytes = 0),
         (0, "lies on nodes [2, 2]", |r| r.made.groups[0].holders = vec![2, 2]),
-        (0, "film/a has no bytes", |r| r.made.film.as_mut().expect("film").bytes = 0),
+        (0, "film/a has no bytes", |r| r.made.film[0].bytes = 0),
         (0, "another image", |r| r.image = "other".into()),
         (1, "film tiles", |r| snapshot(r).done = Done::none(3)),
         (1, "9 commits", |r| snapshot(r).commits = 9),
@@ -297,6 +297,22 @@ fn a_record_that_cannot_be_is_named_and_refused() {
     assert!(follow(&scope, &other[..1]).is_ok_and(|l| l.waiting().any(|g| !is_of_cut(g, "cut"))));
 }
 
+/// Records of earlier versions name one part of the film or none, and those of small films are still written so.
+#[test]
+fn film_is_named_as_it_was_before_there_were_bands() {
+    let (_, records) = chain();
+    let text = serde_json::to_value(&records[0].1).unwrap();
+    let old = serde_json::json!({"key": "film/a", "bytes": 10, "holders": [0, 1]});
+    assert_eq!((&text["made"]["film"], &text["snapshot"]), (&old, &serde_json::Value::Null));
+    assert_eq!(serde_json::to_value(&records[2].1).unwrap()["made"]["film"], serde_json::Value::Null);
+    for (_, mut record) in records {
+        let one = record.made.film.clone();
+        record.made.film.extend(one.into_iter().map(|f| FilmRef { band: Some(7), ..f }));
+        let back: Record = serde_json::from_str(&serde_json::to_string(&record).unwrap()).unwrap();
+        assert_eq!(back, record);
+    }
+}
+
 proptest! {
     /// What is sound is what adding its ranges one by one gives.
     #[test]
@@ -313,7 +329,7 @@ proptest! {
     /// From whichever place a chain can be begun, the same state is reached.
     #[test]
     fn a_chain_reaches_as_far_back_as_it_can(lost in prop::collection::btree_set(0u64..12, 0..4), snapshots in prop::collection::btree_set(0u64..12, 0..5)) {
-        let state = Ledger::new("image", 1).snapshot(None);
+        let state = Ledger::new("image", 1).snapshot(Vec::new());
         let record = |n: u64| Record {
             image: "image".into(),
             sequence: n,

@@ -3,7 +3,7 @@
 use std::cell::OnceCell;
 use std::collections::BTreeMap;
 
-use rayherd_render::film::FilmPart;
+use rayherd_render::film::{BoundedFilm, FilmPart};
 use rayherd_render::frame::Frame;
 use rayherd_render::path::{Context, PathRay};
 use rayherd_render::skip::{Skip, SkipCounts};
@@ -44,8 +44,8 @@ pub struct Attempt {
 pub struct Made {
     /// To be committed.
     pub outputs: Outputs,
-    /// Its part of the film.
-    pub film: FilmPart,
+    /// Its part of the film, where it is handed over in memory.
+    pub film: Option<FilmPart>,
     /// Rays that left the split set.
     pub hops: u64,
     /// What it did not do.
@@ -62,10 +62,27 @@ pub struct Shared<'a> {
     pub settings: &'a JobSettings,
     /// The nodes.
     pub nodes: Nodes<'a>,
-    /// Whether film parts are stored (else they are handed over in memory only).
-    pub store_film: bool,
+    /// What becomes of the tasks' film.
+    pub film: FilmUse,
     /// Number of buckets of the reduce step.
     pub buckets: u32,
+}
+
+/// What becomes of the film of a task.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum FilmUse {
+    /// It is handed over in memory, to whoever holds all of it; and stored as one part, if so.
+    Handed {
+        /// Whether it is stored.
+        stored: bool,
+    },
+    /// It is stored only, a part for each band ([`crate::remote::bands`]).
+    Banded {
+        /// Tiles of a band.
+        band: u32,
+        /// Most tiles that the task holds as sums.
+        most: usize,
+    },
 }
 
 impl Shared<'_> {
@@ -104,7 +121,13 @@ pub fn run(shared: &Shared, attempt: &Attempt, stop: &dyn Stop) -> Result<Made, 
     let sink = Store { shared, attempt };
     let mut groups = Groups::new(&sink, shared.settings.ray_buffer);
     let skips = shared.scene.skips();
-    let mut film = FilmPart::new(shared.frame.size);
+    let mut film = BoundedFilm::new(
+        shared.frame.size,
+        match shared.film {
+            FilmUse::Handed { .. } => usize::MAX,
+            FilmUse::Banded { most, .. } => most,
+        },
+    );
     let mut camera = CameraFeed::new(shared.frame, attempt.camera.clone(), skips);
     let mut trace = Loop::new(shared.settings.kernel, shared.settings.batch as usize, skips)?;
     let tiles = shared.nodes.blocks(attempt.node);
@@ -139,16 +162,40 @@ pub fn run(shared: &Shared, attempt: &Attempt, stop: &dyn Stop) -> Result<Made, 
     let rays = trace.rays;
     let groups = groups.finish()?;
     let non_finite = film.rejected().count;
-    let film_ref = if shared.store_film && (film.touched() > 0 || non_finite > 0) {
-        let key = format!("film/{}", attempt.name);
-        let body = codec::encode_film(&film);
+    let (parts, film) = store_film(shared, attempt, film)?;
+    Ok(Made { outputs: Outputs { groups, film: parts, rays, non_finite }, film, hops, skipped })
+}
+
+/// Stores the film as it is to be; its parts, and itself if it is to be handed over.
+fn store_film(
+    shared: &Shared,
+    attempt: &Attempt,
+    film: BoundedFilm,
+) -> Result<(Vec<FilmRef>, Option<FilmPart>), JobError> {
+    let mut parts = Vec::new();
+    let mut store = |band: Option<u32>, part: Vec<u8>| {
+        let name = &attempt.name;
+        let key = band.map_or_else(|| format!("film/{name}"), |b| format!("film/{name}-b{b:05}"));
+        let body = codec::seal_film(&part);
         let bytes = body.len() as u64;
         let holders = shared.nodes.put(attempt.node, Kind::Film, &key, body)?;
-        Some(FilmRef { key, bytes, holders })
-    } else {
-        None
+        parts.push(FilmRef { key, band, bytes, holders });
+        Ok::<(), JobError>(())
     };
-    Ok(Made { outputs: Outputs { groups, film: film_ref, rays, non_finite }, film, hops, skipped })
+    match shared.film {
+        FilmUse::Handed { stored } => {
+            let film = film.into_part();
+            if stored && (film.touched() > 0 || film.rejected().count > 0) {
+                store(None, film.encode())?;
+            }
+            Ok((parts, Some(film)))
+        }
+        FilmUse::Banded { band: size, .. } => {
+            let several = film.tiles() > size as usize;
+            film.into_bands(size, |band, part| store(several.then_some(band), part))?;
+            Ok((parts, None))
+        }
+    }
 }
 
 /// Stops also when a texture cannot be had: what is shaded without it is wrong.
@@ -171,7 +218,7 @@ struct Task<'a, 'f> {
     textures: &'a TaskTextures<'a>,
     trace: &'a mut Loop,
     camera: &'a mut CameraFeed<'f>,
-    film: &'a mut FilmPart,
+    film: &'a mut BoundedFilm,
     /// Splits that were used without their attributes.
     unread: u64,
 }

@@ -29,7 +29,8 @@ impl<'n, 'a> MemoryFilm<'n, 'a> {
 
 impl FilmSum for MemoryFilm<'_, '_> {
     fn add(&mut self, made: &Made) -> Result<(), JobError> {
-        Ok(self.now.merge(&made.film)?)
+        let part = made.film.as_ref().ok_or_else(|| JobError::Internal("a task hands no film over".into()))?;
+        Ok(self.now.merge(part)?)
     }
     fn settle(&mut self) {
         self.settled.clone_from(&self.now);
@@ -37,7 +38,7 @@ impl FilmSum for MemoryFilm<'_, '_> {
     fn go_back(&mut self) {
         self.now.clone_from(&self.settled);
     }
-    fn store(&mut self, name: &str) -> Result<Option<FilmRef>, JobError> {
+    fn store(&mut self, name: &str) -> Result<Vec<FilmRef>, JobError> {
         journal::store_film(self.nodes, &self.now, name)
     }
     fn rel_mse(&mut self, spp: u32) -> Result<Option<f64>, JobError> {

@@ -138,7 +138,7 @@ pub fn resume(nodes: &Nodes, image: &str, scope: &Scope, size: [u32; 2]) -> Resu
     }
     let Some(Replayed { mut ledger, film, settled, lost }) = best else {
         let (ledger, film) = (Ledger::new(image, scope.tiles), FilmPart::new(size));
-        let settled = (ledger.snapshot(None), film.clone());
+        let settled = (ledger.snapshot(Vec::new()), film.clone());
         return Ok(Resumed { ledger, film, settled, reused: 0, lost: 0 });
     };
     let reused = ledger.commits();
@@ -150,7 +150,7 @@ pub fn resume(nodes: &Nodes, image: &str, scope: &Scope, size: [u32; 2]) -> Resu
     let record = ledger.record_of(snapshot);
     let name = write(nodes, &record)?;
     ledger.go_back(&record, name)?;
-    let settled = (ledger.snapshot(None), film.clone());
+    let settled = (ledger.snapshot(Vec::new()), film.clone());
     Ok(Resumed { ledger, film, settled, reused: kept, lost: reused.saturating_sub(kept) })
 }
 
@@ -172,7 +172,7 @@ fn replay(
     records: &[(String, Record)],
 ) -> Result<Replayed, JobError> {
     let (mut ledger, mut film) = (Ledger::new(image, scope.tiles), FilmPart::new(size));
-    let mut settled = (ledger.snapshot(None), film.clone());
+    let mut settled = (ledger.snapshot(Vec::new()), film.clone());
     let mut lost = None;
     for (number, (name, record)) in records.iter().enumerate() {
         // the sum so far is that of a snapshot of the same state
@@ -187,7 +187,7 @@ fn replay(
             parts = snapshot.film.as_slice();
         }
         match parts.iter().try_for_each(|part| merge(nodes, &mut film, part, size)) {
-            Ok(()) if ledger.is_settled() => settled = (ledger.snapshot(None), film.clone()),
+            Ok(()) if ledger.is_settled() => settled = (ledger.snapshot(Vec::new()), film.clone()),
             Ok(()) => {}
             Err(e @ JobError::Lost { .. }) => lost = Some(e),
             Err(e) => return Err(e),
@@ -215,20 +215,20 @@ fn whole(nodes: &Nodes, scope: &Scope, ledger: &Ledger) -> Result<(), JobError> 
 }
 
 fn merge(nodes: &Nodes, film: &mut FilmPart, part: &FilmRef, size: [u32; 2]) -> Result<(), JobError> {
-    let part = nodes.get(0, ByteKind::Film, &part.key, &part.holders, |body| codec::decode_film(size, body))?;
-    Ok(film.merge(&part)?)
+    let part = nodes.get(0, ByteKind::Film, &part.key, &part.holders, |body| codec::open_film(size, body))?;
+    Ok(film.add_encoded(&part, 0..u32::MAX)?)
 }
 
 /// Stores a whole film under `prefix` and its hash: whoever names it means these bytes, whatever is stored later.
-pub fn store_film(nodes: &Nodes, film: &FilmPart, prefix: &str) -> Result<Option<FilmRef>, JobError> {
+pub fn store_film(nodes: &Nodes, film: &FilmPart, prefix: &str) -> Result<Vec<FilmRef>, JobError> {
     if film.touched() == 0 && film.rejected().count == 0 {
-        return Ok(None);
+        return Ok(Vec::new());
     }
-    let body = codec::encode_film(film);
+    let body = codec::seal_film(&film.encode());
     let bytes = body.len() as u64;
     let key = format!("{prefix}-{}", &blake3::hash(&body).to_hex()[..16]);
     let holders = nodes.put(0, ByteKind::Film, &key, body)?;
-    Ok(Some(FilmRef { key, bytes, holders }))
+    Ok(vec![FilmRef { key, band: None, bytes, holders }])
 }
 
 /// What a collection deleted.

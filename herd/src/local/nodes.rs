@@ -74,6 +74,8 @@ pub struct Nodes<'a> {
 struct ReadOnce {
     splits: Vec<bool>,
     tiles: Vec<bool>,
+    /// What was read for the first time since this was asked last.
+    new: Vec<Part>,
 }
 
 #[derive(Default)]
@@ -89,9 +91,16 @@ impl<'a> Nodes<'a> {
         if settings.nodes.len() > 1 {
             nodes.disks = Some(Disks::new(settings.nodes.len(), nodes.replicas as usize)?);
         }
-        let (splits, tiles) = (scene.manifest.splits.len(), scene.manifest.tiles.len());
-        nodes.read = Some(Mutex::new(ReadOnce { splits: vec![false; splits], tiles: vec![false; tiles] }));
-        Ok(nodes)
+        Ok(nodes.noting_reads())
+    }
+
+    /// The same; what is read is noted.
+    #[must_use]
+    pub fn noting_reads(mut self) -> Self {
+        let (splits, tiles) = (self.scene.manifest.splits.len(), self.scene.manifest.tiles.len());
+        let none = ReadOnce { splits: vec![false; splits], tiles: vec![false; tiles], new: Vec::new() };
+        self.read = Some(Mutex::new(none));
+        self
     }
 
     /// Nodes of which the first `keepers` hold rays and film, in stores of their own below `nodes/N/`; blocks come from `fetch`.
@@ -153,10 +162,28 @@ impl<'a> Nodes<'a> {
     fn note_read(&self, part: Part) {
         let Some(read) = &self.read else { return };
         let mut read = read.lock().unwrap_or_else(PoisonError::into_inner);
-        match part {
-            Part::Split(n) => read.splits[n as usize] = true,
-            Part::Tile(n) => read.tiles[n as usize] = true,
+        let read = &mut *read;
+        let known = match part {
+            Part::Split(n) => &mut read.splits[n as usize],
+            Part::Tile(n) => &mut read.tiles[n as usize],
+        };
+        if !std::mem::replace(known, true) {
+            read.new.push(part);
         }
+    }
+
+    /// Splits and texture tiles that were read for the first time since this was asked last, by number.
+    pub fn take_reads(&self) -> (Vec<u32>, Vec<u32>) {
+        let Some(read) = &self.read else { return Default::default() };
+        let new = std::mem::take(&mut read.lock().unwrap_or_else(PoisonError::into_inner).new);
+        let (mut splits, mut tiles) = (Vec::new(), Vec::new());
+        for part in new {
+            match part {
+                Part::Split(n) => splits.push(n),
+                Part::Tile(n) => tiles.push(n),
+            }
+        }
+        (splits, tiles)
     }
 
     /// How many splits and texture tiles no node has read; none if that is not known here.

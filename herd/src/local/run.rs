@@ -6,7 +6,7 @@ use std::sync::mpsc::channel;
 use rayherd_render::film::FilmPart;
 use rayherd_render::frame::Frame;
 
-use super::attempt::Shared;
+use super::attempt::{FilmUse, Shared};
 use super::faults::Schedule;
 use super::film::{MemoryFilm, image};
 use super::nodes::Nodes;
@@ -48,14 +48,14 @@ pub fn render_local(
         frame,
         settings,
         nodes: Nodes::new(scene, settings, store)?,
-        store_film: settings.commits.is_some() || settings.nodes.len() > 1,
+        film: FilmUse::Handed { stored: settings.commits.is_some() || settings.nodes.len() > 1 },
         buckets: settings.slots(),
     };
     shared.nodes.read_unasked()?;
     let Some(commits) = &settings.commits else {
         let ledger = Ledger::new(&scene.image_name(frame)?, tiles(frame));
         let start = Start {
-            settled: ledger.snapshot(None),
+            settled: ledger.snapshot(Vec::new()),
             ledger,
             film: MemoryFilm::new(&shared.nodes, FilmPart::new(frame.size), FilmPart::new(frame.size)),
             pointer: None,

@@ -83,7 +83,7 @@ mod tests {
     use super::*;
     use crate::job::{JobSettings, PreparedScene};
     use crate::ledger::TaskId;
-    use crate::local::attempt::Attempt;
+    use crate::local::attempt::{Attempt, FilmUse};
     use crate::local::nodes::Nodes;
     use crate::local::slots::StopFlag;
     use crate::plan::Set;
@@ -95,7 +95,14 @@ mod tests {
         let scene: PreparedScene = testing::prepared(&testing::cornell(), 1, true);
         let (frame, settings) = (testing::frame(&scene, [8, 8], 1), JobSettings::default());
         let nodes = Nodes::new(&scene, &settings, Arc::new(MemoryStore::default())).unwrap();
-        let shared = Shared { scene: &scene, frame: &frame, settings: &settings, nodes, store_film: false, buckets: 1 };
+        let shared = Shared {
+            scene: &scene,
+            frame: &frame,
+            settings: &settings,
+            nodes,
+            film: FilmUse::Handed { stored: false },
+            buckets: 1,
+        };
         let (gate, (send, receive)) = (Gate::new(1), channel());
         std::thread::scope(|scope| {
             let threads = Threads::new(scope, &shared, &gate, (send, &receive));

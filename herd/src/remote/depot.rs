@@ -40,10 +40,23 @@ impl Depot {
         Ok(Depot { watched: stores, ..Depot::new(plain, home)? })
     }
 
-    /// Stores whose machines are known to be silent for at least so long.
+    /// Stores whose machines are known to be silent for at least so long, or that have lost what they held.
     pub fn silent(&self, least: Duration) -> Vec<u32> {
-        let silent = |s: &Arc<Watched>| s.silent_for().is_some_and(|t| t >= least);
+        let silent = |s: &Arc<Watched>| s.is_emptied() || s.silent_for().is_some_and(|t| t >= least);
         (0..).zip(&self.watched).filter(|(_, s)| silent(s)).map(|(n, _)| n).collect()
+    }
+
+    /// Whether a store was seen last without its bucket.
+    pub fn is_emptied(&self, store: u32) -> bool {
+        self.watched.get(store as usize).is_some_and(|s| s.is_emptied())
+    }
+
+    /// When none of the stores has the bucket, that is what is wrong, and not that one of them lacks something.
+    pub fn without_bucket(&self) -> Option<StoreError> {
+        let all = !self.watched.is_empty() && self.watched.iter().all(|s| s.is_emptied());
+        let message =
+            "none of the job's servers has the bucket that its storage profile names: create it on each".to_owned();
+        all.then(|| StoreError::Misconfigured { store: self.stores[0].describe(), message })
     }
 
     /// Looks, where it is time to, whether machines that were silent are back.

@@ -7,7 +7,6 @@ use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
-use rayherd_render::film::FilmPart;
 use tokio::sync::Notify;
 
 use super::message::{Answer, Beat, Done, Failure, Poll, Report, Stage, Work, WorkerId};
@@ -38,7 +37,6 @@ pub struct Fleet {
 struct State {
     epoch: String,
     next: u64,
-    size: [u32; 2],
     stage: Option<Stage>,
     /// Stores that hold each split.
     placement: Vec<Vec<u32>>,
@@ -55,6 +53,8 @@ struct State {
     failing: Option<Instant>,
     bytes: Bytes,
     cpu: f64,
+    /// Splits and texture tiles that somebody has read in this stage.
+    read: [BTreeSet<u32>; 2],
     first_attempt: Option<Instant>,
     over: bool,
     /// Another fleet has the workers now.
@@ -69,6 +69,8 @@ struct Worker {
     ready: VecDeque<(TaskId, u32, Work, StopFlag)>,
     /// It has the current stage open.
     open: bool,
+    /// It can take a band out of a film part.
+    bands: bool,
 }
 
 struct Doing {
@@ -111,7 +113,7 @@ impl Fleet {
     pub fn open(&self, stage: Stage, placement: Vec<Vec<u32>>) {
         let mut state = self.lock();
         state.placement = placement;
-        state.size = stage.frame.size;
+        state.read = Default::default();
         state.stage = Some(stage);
         state.emptied.clear();
         state.workers.iter_mut().flatten().for_each(|w| w.open = false);
@@ -144,6 +146,15 @@ impl Fleet {
         let state = self.lock();
         let ready = state.workers.iter().flatten().filter(|w| w.seen.elapsed() < SILENCE).count() as u32;
         Tally { ready, bytes: state.bytes.clone(), cpu: state.cpu, first_attempt: state.first_attempt }
+    }
+    /// How many of the splits and of the texture tiles nobody has read since the stage began, of so many.
+    pub fn never_read(&self, all: [usize; 2]) -> [u64; 2] {
+        let state = self.lock();
+        std::array::from_fn(|i| all[i].saturating_sub(state.read[i].len()) as u64)
+    }
+    /// Whether all workers that are there can take a band out of a film part.
+    pub fn knows_bands(&self) -> bool {
+        self.lock().workers.iter().flatten().all(|w| w.bands)
     }
     /// The store on the node of each worker, where known.
     pub fn homes(&self) -> Vec<Option<u32>> {
@@ -201,7 +212,10 @@ impl Fleet {
         let in_stage = poll.stage.is_some();
         let worker = state.workers[poll.worker.number as usize].as_mut().ok_or(Unknown)?;
         worker.open |= in_stage;
-        let (what, work) = if let Some((call, work)) = state.common.pop_front() {
+        worker.bands = poll.bands;
+        let can = |work: &Work| poll.bands || !matches!(work, Work::Merge { band: Some(_), .. });
+        let first = state.common.iter().position(|(_, work)| can(work));
+        let (what, work) = if let Some((call, work)) = first.and_then(|at| state.common.remove(at)) {
             (What::Call { call, work: work.clone() }, work)
         } else if !poll.clerk
             && let Some((task, number, work, stop)) =
@@ -232,6 +246,10 @@ impl Fleet {
         report.bytes.iter().for_each(|r| bytes.add(r.stage, r.op, r.kind, r.place, r.bytes));
         state.bytes.merge(&bytes);
         state.cpu += report.cpu;
+        if state.stage.as_ref().is_some_and(|s| s.id == report.reads.stage) {
+            state.read[0].extend(report.reads.splits);
+            state.read[1].extend(report.reads.tiles);
+        }
         match (doing.what, report.result) {
             (What::Attempt { task, number, .. }, result) => {
                 let result = state.judge(result);
@@ -279,6 +297,45 @@ impl Fleet {
         done.ok_or_else(|| JobError::Internal("work was given up that was to be waited for".into()))
     }
 
+    /// Has workers do several things, in whatever order, and waits for all; what came out, in theirs.
+    ///
+    /// # Errors
+    /// When one of them cannot be done; then the rest is given up.
+    pub fn call_all(&self, works: Vec<Work>) -> Result<Vec<Done>, JobError> {
+        let mut state = self.lock();
+        let first = state.next;
+        let calls = first..first + works.len() as u64;
+        state.next = calls.end;
+        state.common.extend(calls.clone().zip(works));
+        self.wanted.notify_waiters();
+        let mut done = Vec::new();
+        for call in calls.clone() {
+            let result = loop {
+                if let Some(result) = state.answers.remove(&call) {
+                    break result.map_err(Failure::into_error);
+                }
+                if let Err(e) = state.check() {
+                    break Err(e);
+                }
+                if state.sweep() {
+                    self.wanted.notify_waiters();
+                }
+                state = self.wait(state, Duration::from_millis(200));
+            };
+            match result {
+                Ok(result) => done.push(result),
+                Err(e) => {
+                    // what runs reports to nobody
+                    state.common.retain(|(c, _)| !calls.contains(c));
+                    state.doing.retain(|_, d| !matches!(d.what, What::Call { call, .. } if calls.contains(&call)));
+                    state.answers.retain(|c, _| !calls.contains(c));
+                    return Err(e);
+                }
+            }
+        }
+        Ok(done)
+    }
+
     /// As [`Fleet::call`], as long as a worker is there: none when all are gone, and nobody does it.
     ///
     /// # Errors
@@ -295,11 +352,7 @@ impl Fleet {
         self.wanted.notify_waiters();
         loop {
             if let Some(result) = state.answers.remove(&call) {
-                return result.map(Some).map_err(|f| match f {
-                    Failure::Lost { name, why } => JobError::Lost { name, why },
-                    Failure::Stopped => JobError::Stopped,
-                    Failure::ForNow { message } | Failure::ForGood { message } => JobError::Settings(message),
-                });
+                return result.map(Some).map_err(Failure::into_error);
             }
             state.check()?;
             if state.sweep() {
@@ -363,7 +416,8 @@ impl State {
         if newcomer {
             self.leave(worker.number);
             let (session, seen) = (worker.session.clone(), Instant::now());
-            self.workers[number] = Some(Worker { session, home, seen, ready: VecDeque::new(), open: false });
+            self.workers[number] =
+                Some(Worker { session, home, seen, ready: VecDeque::new(), open: false, bands: true });
         }
         if let Some(w) = &mut self.workers[number] {
             w.seen = Instant::now();
@@ -430,7 +484,7 @@ impl State {
         match result {
             Ok(Done::Made { outputs, hops, skipped }) => {
                 self.succeeded();
-                Ok(Made { outputs, film: FilmPart::new(self.size), hops, skipped })
+                Ok(Made { outputs, film: None, hops, skipped })
             }
             Ok(_) => Err(JobError::Internal("a worker reports something else than it was to do".into())),
             Err(Failure::Stopped) => Err(JobError::Stopped),

@@ -4,6 +4,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use rayherd_api::{Placement, RenderJobSpec};
+use rayherd_render::skip::Skip;
 use rayherd_scene::manifest::Manifest;
 use rayherd_scene::objects::{ObjectRef, ObjectStore};
 use tokio::runtime::Handle;
@@ -15,7 +16,7 @@ use super::{Depot, Fleet, Turns};
 use crate::driver::{Driver, Pointer, Start};
 use crate::job::{JobError, JobSettings, NodeSpec, PreparedScene, Progress, Sampling, spec as from_spec};
 use crate::ledger::{FilmRef, Ledger, Scope, Snapshot, is_of_cut, record_key};
-use crate::local::attempt::Shared;
+use crate::local::attempt::{FilmUse, Shared};
 use crate::local::journal;
 use crate::local::nodes::{Nodes, placement};
 use crate::report;
@@ -65,6 +66,8 @@ pub struct Job<'a> {
     pub turns: &'a Turns,
     /// Slots of each worker.
     pub slots: Vec<u32>,
+    /// Tiles of a band of the film ([`super::bands`]).
+    pub band: u32,
     /// Where input and output runs; not the caller's thread.
     pub runtime: Handle,
 }
@@ -74,10 +77,15 @@ pub struct Job<'a> {
 /// # Errors
 /// When it cannot be finished; what was committed stays.
 pub fn run(job: &Job, keeper: &Arc<dyn Keeper>, progress: &dyn Progress) -> Result<(), JobError> {
+    let no_bucket = |e: JobError| if e.may_pass() { job.depot.without_bucket().map_or(e, JobError::from) } else { e };
+    frames(job, keeper, progress).map_err(no_bucket)
+}
+
+fn frames(job: &Job, keeper: &Arc<dyn Keeper>, progress: &dyn Progress) -> Result<(), JobError> {
     let spec = job.spec;
     let replicas = spec.replicas.map_or(1, |r| r as u32).clamp(1, job.depot.len());
-    let (reference, reused) = match known(job, replicas)? {
-        Some(known) => (known, true),
+    let (reference, reused, cells_passed) = match known(job, replicas)? {
+        Some(known) => (known, true, 0),
         None => prepared(job, replicas)?,
     };
     keeper.prepared(&reference, reused);
@@ -108,14 +116,21 @@ pub fn run(job: &Job, keeper: &Arc<dyn Keeper>, progress: &dyn Progress) -> Resu
             replicas,
             near: spec.placement != Placement::None,
             buckets: job.slots.iter().sum(),
+            band: job.band,
         };
-        render(job, keeper, progress, &scene, &stage, &places, &sampling, (number, picture))?;
+        let (at, mut report) = render(job, keeper, progress, &scene, &stage, &places, &sampling, (number, picture))?;
+        // known to whoever prepared the scene
+        let kept = if reused { scene.manifest.objects().count() as u64 } else { 0 };
+        for (skip, count) in [(Skip::Prepared, kept), (Skip::Volume, cells_passed)] {
+            report.skips.insert(skip.name().to_owned(), count);
+        }
+        keeper.done(number, &at, &report);
     }
     Ok(())
 }
 
-/// Has the scene prepared by a worker, unless it is; its manifest, and whether it was there.
-fn prepared(job: &Job, replicas: u32) -> Result<(ObjectRef, bool), JobError> {
+/// Has the scene prepared by a worker, unless it is; its manifest, whether it was there, and cells of volumes that were not looked into.
+fn prepared(job: &Job, replicas: u32) -> Result<(ObjectRef, bool, u64), JobError> {
     let prepare = Work::Prepare { spec: Box::new(job.spec.clone()), replicas };
     loop {
         // whose turn it is must have who does it: jobs that wait with their workers may leave no room for its own
@@ -123,7 +138,7 @@ fn prepared(job: &Job, replicas: u32) -> Result<(ObjectRef, bool), JobError> {
         // of two jobs that come at once with one scene, the second finds it prepared
         let _turn = job.turns.take(&job.spec.scene.source, || job.fleet.check())?;
         match job.fleet.call_while_staffed(prepare.clone())? {
-            Some(Done::Prepared { scene, reused }) => return Ok((scene, reused)),
+            Some(Done::Prepared { scene, reused, cells_passed }) => return Ok((scene, reused, cells_passed)),
             Some(_) => return Err(JobError::Internal("a worker reports something else than it was to do".into())),
             None => tracing::warn!("the worker that was to prepare the scene is gone: others come first"),
         }
@@ -154,7 +169,7 @@ fn render(
     places: &[Vec<u32>],
     sampling: &Sampling,
     (number, picture): (u32, &str),
-) -> Result<(), JobError> {
+) -> Result<(Vec<String>, report::Report), JobError> {
     let defaults = JobSettings::default();
     let settings = JobSettings {
         strategy: stage.strategy,
@@ -172,7 +187,7 @@ fn render(
         frame: &stage.frame,
         settings: &settings,
         nodes: Nodes::real(scene, &settings, part.clone(), job.depot.len(), None)?,
-        store_film: true,
+        film: FilmUse::Banded { band: stage.band, most: 0 },
         buckets: stage.buckets,
     };
     let image = scene.image_name(&stage.frame)?;
@@ -181,7 +196,8 @@ fn render(
     // where nobody looks where data lies, nobody holds any
     let places = if stage.near { places.to_vec() } else { vec![Vec::new(); places.len()] };
     job.fleet.open(stage.clone(), places);
-    let (resumed, film_lost) = whole(job.fleet, states)?;
+    let film = (stage.frame.size, stage.band);
+    let (resumed, film_lost) = whole(job.fleet, film, states)?;
     // rays that wait for splits of another cut of the scene are of no use
     let other_cut = resumed.ledger.waiting().find(|g| !is_of_cut(g, &scene.cut)).map(|g| g.key.clone());
     let other_cut = other_cut.map(|name| JobError::Lost { name, why: journal::OTHER_CUT.into() });
@@ -189,7 +205,7 @@ fn render(
     let start = Start {
         reused: if lost.is_some() { resumed.settled.0.commits } else { resumed.ledger.commits() },
         ledger: resumed.ledger,
-        film: Parts::new(job.fleet, resumed.film, resumed.settled.1),
+        film: Parts::new(job.fleet, film, resumed.film, resumed.settled.1),
         settled: resumed.settled.0,
         pointer: Some(Arc::new(pointer)),
         session: job.session.clone(),
@@ -208,10 +224,14 @@ fn render(
     }
     driver.stop_all();
     let (film, spp, mut report) = driver.finish()?;
-    let merged = film.merge(None, spp, Some(picture.to_owned()))?;
-    report.note_non_finite(stage.frame.size[0], &merged.non_finite);
-    keeper.done(number, &merged.picture, &report);
-    Ok(())
+    let made = film.picture(spp, picture)?;
+    report.note_non_finite(stage.frame.size[0], &made.non_finite);
+    let m = &scene.manifest;
+    let never = job.fleet.never_read([m.splits.len(), m.tiles.len()]);
+    for (skip, count) in [Skip::Splits, Skip::Textures].into_iter().zip(never) {
+        report.skips.insert(skip.name().to_owned(), count);
+    }
+    Ok((made.at, report))
 }
 
 struct FramePointer {
@@ -242,7 +262,7 @@ struct Resumed {
 fn resume(nodes: &Nodes, image: &str, scope: &Scope, pointer: Option<(u64, String)>) -> Result<Vec<Resumed>, JobError> {
     let begin = || {
         let ledger = Ledger::new(image, scope.tiles);
-        Resumed { settled: (ledger.snapshot(None), Vec::new()), ledger, film: Vec::new(), lost: 0 }
+        Resumed { settled: (ledger.snapshot(Vec::new()), Vec::new()), ledger, film: Vec::new(), lost: 0 }
     };
     let Some((sequence, name)) = pointer else { return Ok(vec![begin()]) };
     let mut records = nodes.wait(journal::read(nodes.store().as_ref()))?;
@@ -264,11 +284,11 @@ fn resume(nodes: &Nodes, image: &str, scope: &Scope, pointer: Option<(u64, Strin
             let anew = record.snapshot.as_ref().filter(|s| number == 0 || !state.ledger.is_as(s));
             scope.replay(&mut state.ledger, record, name.clone())?;
             if let Some(snapshot) = anew {
-                state.film = snapshot.film.iter().cloned().collect();
+                state.film.clone_from(&snapshot.film);
             }
             state.film.extend(record.made.film.clone());
             if state.ledger.is_settled() {
-                state.settled = (state.ledger.snapshot(None), state.film.clone());
+                state.settled = (state.ledger.snapshot(Vec::new()), state.film.clone());
             }
         }
         Ok(state)
@@ -277,8 +297,8 @@ fn resume(nodes: &Nodes, image: &str, scope: &Scope, pointer: Option<(u64, Strin
 }
 
 /// The first of some states whose film is whole; else the one with most in it of those that can be gone back to, and what is lost.
-fn whole(fleet: &Fleet, states: Vec<Resumed>) -> Result<(Resumed, Option<JobError>), JobError> {
-    let is_whole = |parts: &[FilmRef]| match Parts::new(fleet, parts.to_vec(), Vec::new()).merge(None, 1, None) {
+fn whole(fleet: &Fleet, film: ([u32; 2], u32), states: Vec<Resumed>) -> Result<(Resumed, Option<JobError>), JobError> {
+    let is_whole = |parts: &[FilmRef]| match Parts::new(fleet, film, parts.to_vec(), Vec::new()).look(1) {
         Ok(_) => Ok(None),
         Err(e @ JobError::Lost { .. }) => Ok(Some(e)),
         Err(e) => Err(e),
@@ -291,7 +311,7 @@ fn whole(fleet: &Fleet, states: Vec<Resumed>) -> Result<(Resumed, Option<JobErro
         tracing::warn!("{why}; an older snapshot is tried");
         if !state.settled.1.is_empty() && is_whole(&state.settled.1)?.is_some() {
             let nothing = Ledger::new(state.ledger.image(), state.ledger.done().tiles());
-            state.settled = (nothing.snapshot(None), Vec::new());
+            state.settled = (nothing.snapshot(Vec::new()), Vec::new());
         }
         if best.as_ref().is_none_or(|(b, _)| state.settled.0.commits > b.settled.0.commits) {
             best = Some((state, Some(why)));

@@ -83,10 +83,17 @@ impl<'a> Guard<'a> {
 
     /// What there is too little of, if that changed.
     fn tell(&self, state: &mut State) {
-        let of = |(n, few): (&u32, &Option<u64>)| match few {
-            None => Some(format!("store {n} is silent: what lies on it has a copy less, and is being copied")),
-            Some(0) => None,
-            Some(few) => Some(format!("store {n} is silent: {few} object(s) of the job have too few copies, or none")),
+        let of = |(n, few): (&u32, &Option<u64>)| {
+            let why = if self.depot.is_emptied(*n) {
+                "has lost its bucket and all that was in it (create the bucket, and it is used again)"
+            } else {
+                "is silent"
+            };
+            match few {
+                None => Some(format!("store {n} {why}: what lay on it has a copy less, and is being copied")),
+                Some(0) => None,
+                Some(few) => Some(format!("store {n} {why}: {few} object(s) of the job have too few copies, or none")),
+            }
         };
         let below: Vec<String> = state.lost.iter().filter_map(of).collect();
         let said = (!below.is_empty()).then(|| below.join("; "));

@@ -1,6 +1,7 @@
 //! Messages between workers and operator. Small: names, numbers and counts; rays, film and blocks go through the stores.
 
 use rayherd_api::{RenderJobSpec, Strategy};
+use rayherd_render::film::ErrorSum;
 use rayherd_render::frame::Frame;
 use rayherd_render::skip::SkipCounts;
 use rayherd_scene::objects::ObjectRef;
@@ -33,6 +34,9 @@ pub struct Poll {
     pub stage: Option<String>,
     /// It takes no attempts: so that film is added up while all slots compute.
     pub clerk: bool,
+    /// It can take a band out of a film part; workers of earlier versions add all of it.
+    #[serde(default)]
+    pub bands: bool,
 }
 
 /// What it is told.
@@ -79,6 +83,14 @@ pub struct Stage {
     pub near: bool,
     /// Buckets of the reduce step.
     pub buckets: u32,
+    /// Tiles of a band of the film.
+    #[serde(default = "whole")]
+    pub band: u32,
+}
+
+/// Operators of versions without bands take films as a whole.
+fn whole() -> u32 {
+    u32::MAX
 }
 
 /// Something to do.
@@ -97,7 +109,7 @@ pub enum Work {
         /// What.
         attempt: Attempt,
     },
-    /// Add film parts.
+    /// Add film parts, or make a picture of their sum.
     Merge {
         /// The sum is stored under this name; not at all without one.
         name: Option<String>,
@@ -105,8 +117,11 @@ pub enum Work {
         parts: Vec<FilmRef>,
         /// Samples per pixel in the sum, for its error and the picture.
         spp: u32,
-        /// The picture is written under this key of the storage, as OpenEXR.
+        /// The picture is written under this key of the storage, as OpenEXR, band by band; then nothing else is stored.
         picture: Option<String>,
+        /// Only this band of the film; the whole without one.
+        #[serde(default)]
+        band: Option<u32>,
     },
     /// Copy rays and film whose copies on one store cannot be had, from those that are left.
     Copy {
@@ -136,6 +151,21 @@ pub struct Report {
     pub cpu: f64,
     /// Bytes moved.
     pub bytes: Vec<BytesRow>,
+    /// What this worker has read of the scene for the first time.
+    #[serde(default)]
+    pub reads: Reads,
+}
+
+/// Objects of a scene that a worker has read in a stage, and has not told of before.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "camelCase")]
+pub struct Reads {
+    /// The stage.
+    pub stage: String,
+    /// Splits, by number.
+    pub splits: Vec<u32>,
+    /// Texture tiles, by number.
+    pub tiles: Vec<u32>,
 }
 
 /// What came out of a piece of work.
@@ -148,6 +178,9 @@ pub enum Done {
         scene: ObjectRef,
         /// It was there already.
         reused: bool,
+        /// Cells of volumes that were not looked into.
+        #[serde(default)]
+        cells_passed: u64,
     },
     /// Of an attempt.
     Made {
@@ -163,8 +196,12 @@ pub enum Done {
     Merged {
         /// The sum, if it was to be stored and is not empty.
         film: Option<FilmRef>,
-        /// Estimated relMSE.
+        /// Estimated relMSE, of whoever knows no bands.
+        #[serde(default)]
         rel_mse: Option<f64>,
+        /// Sum of the errors that relMSE is the mean of.
+        #[serde(default)]
+        error: Option<ErrorSum>,
         /// Pixel and sample of the first contributions that were not finite.
         non_finite: Vec<(u32, u32)>,
         /// Where the picture lies, if it was asked for.
@@ -207,6 +244,17 @@ pub enum Failure {
         /// What went wrong, and what to do.
         message: String,
     },
+}
+
+impl Failure {
+    /// What it means to whoever had the work done.
+    pub fn into_error(self) -> JobError {
+        match self {
+            Failure::Lost { name, why } => JobError::Lost { name, why },
+            Failure::Stopped => JobError::Stopped,
+            Failure::ForNow { message } | Failure::ForGood { message } => JobError::Settings(message),
+        }
+    }
 }
 
 impl From<&JobError> for Failure {

@@ -4,6 +4,7 @@
 //! store ([`station`]) and reports ids and counts ([`Report`]). [`fleet::Fleet`] is the operator's side: the executor of the
 //! loop over rounds ([`crate::driver`]), fed by workers that come and go. How messages travel is not known here.
 
+pub mod bands;
 pub mod depot;
 pub mod fleet;
 pub mod frames;

@@ -1,5 +1,6 @@
-//! A film that lies in parts on the workers' stores, and is added up by them.
+//! A film that lies in parts on the workers' stores, and is added up by them, band by band.
 
+use super::bands::{self, Totals};
 use super::fleet::Fleet;
 use super::message::{Done, Work};
 use crate::driver::{FilmSum, Objects};
@@ -7,44 +8,92 @@ use crate::job::JobError;
 use crate::ledger::FilmRef;
 use crate::local::attempt::Made;
 
+/// A band of a film with several is added up when it has so many parts: each time all that it holds is read and written, and where tasks
+/// touch all bands that would be most of their time.
+const MANY: usize = 8;
+
 /// References to the parts whose sum the film is.
 pub struct Parts<'f> {
     fleet: &'f Fleet,
+    size: [u32; 2],
+    /// How many there are.
+    bands: u32,
     now: Vec<FilmRef>,
     settled: Vec<FilmRef>,
+    /// The last error that was found, and of how many samples; none when the film has changed since.
+    error: Option<(u32, Option<f64>)>,
 }
 
-/// What adding up has found.
-pub struct Merged {
-    /// The film, if it was to be stored.
-    pub film: Option<FilmRef>,
-    /// Its estimated relMSE.
-    pub rel_mse: Option<f64>,
+/// A picture that was made.
+pub struct Pictured {
     /// Pixel and sample of the first contributions that were not finite.
     pub non_finite: Vec<(u32, u32)>,
-    /// Where the picture lies, if it was asked for.
-    pub picture: Vec<String>,
+    /// Where it lies.
+    pub at: Vec<String>,
 }
 
 impl<'f> Parts<'f> {
-    /// A film whose parts are these; `settled` is what to go back to.
-    pub fn new(fleet: &'f Fleet, now: Vec<FilmRef>, settled: Vec<FilmRef>) -> Self {
-        Parts { fleet, now, settled }
+    /// A film of `size` pixels in bands of so many tiles whose parts are these; `settled` is what to go back to.
+    pub fn new(fleet: &'f Fleet, (size, band): ([u32; 2], u32), now: Vec<FilmRef>, settled: Vec<FilmRef>) -> Self {
+        Parts { fleet, size, bands: bands::count(size, band), now, settled, error: None }
     }
 
-    /// Has the parts added up.
-    pub fn merge(&self, name: Option<&str>, spp: u32, picture: Option<String>) -> Result<Merged, JobError> {
-        let work = Work::Merge { name: name.map(str::to_owned), parts: self.now.clone(), spp, picture };
-        match self.fleet.call(work)? {
-            Done::Merged { film, rel_mse, non_finite, picture } => Ok(Merged { film, rel_mse, non_finite, picture }),
-            _ => Err(JobError::Internal("a worker reports something else than it was to do".into())),
+    /// In how many bands it is added up now: as a whole while a worker of a version without them is there.
+    fn bands(&self) -> u32 {
+        if self.fleet.knows_bands() { self.bands } else { 1 }
+    }
+
+    /// Each band that has something, with its parts.
+    fn by_band(&self) -> impl Iterator<Item = (Option<u32>, Vec<FilmRef>)> {
+        let bands = self.bands();
+        let of_band = move |band: u32| {
+            let several = (bands > 1).then_some(band);
+            let parts = self.now.iter().filter(|p| several.is_none() || p.band.is_none() || p.band == several);
+            (several, parts.cloned().collect::<Vec<_>>())
+        };
+        (0..bands).map(of_band).filter(|(_, parts)| !parts.is_empty())
+    }
+
+    /// Has all parts read and added up, and nothing stored.
+    ///
+    /// # Errors
+    /// When one of them is lost.
+    pub fn look(&self, spp: u32) -> Result<Option<f64>, JobError> {
+        let work = |(band, parts)| Work::Merge { name: None, parts, spp, picture: None, band };
+        let (mut totals, mut plain) = (Totals::default(), None);
+        for done in self.fleet.call_all(self.by_band().map(work).collect())? {
+            let Done::Merged { rel_mse, error, .. } = done else { return Err(other()) };
+            // a worker of a version without bands has divided by all pixels: its share of the mean, rounded otherwise
+            match (error, rel_mse) {
+                (None, Some(share)) => *plain.get_or_insert(0.0) += share,
+                (error, _) => totals.add(error, []),
+            }
+        }
+        let exact = totals.error.map(|e| e.mean(self.size));
+        Ok(if plain.is_some() || exact.is_some() { Some(plain.unwrap_or(0.0) + exact.unwrap_or(0.0)) } else { None })
+    }
+
+    /// Has a picture made of the sum.
+    ///
+    /// # Errors
+    /// When a part is lost, or no store takes the picture.
+    pub fn picture(&self, spp: u32, key: &str) -> Result<Pictured, JobError> {
+        let (parts, picture) = (self.now.clone(), Some(key.to_owned()));
+        match self.fleet.call(Work::Merge { name: None, parts, spp, picture, band: None })? {
+            Done::Merged { non_finite, picture, .. } => Ok(Pictured { non_finite, at: picture }),
+            _ => Err(other()),
         }
     }
+}
+
+fn other() -> JobError {
+    JobError::Internal("a worker reports something else than it was to do".into())
 }
 
 impl FilmSum for Parts<'_> {
     fn add(&mut self, made: &Made) -> Result<(), JobError> {
         self.now.extend(made.outputs.film.clone());
+        self.error = None;
         Ok(())
     }
     fn settle(&mut self) {
@@ -52,20 +101,40 @@ impl FilmSum for Parts<'_> {
     }
     fn go_back(&mut self) {
         self.now.clone_from(&self.settled);
+        self.error = None;
     }
-    fn store(&mut self, name: &str) -> Result<Option<FilmRef>, JobError> {
-        if self.now.is_empty() {
-            return Ok(None);
+    fn store(&mut self, name: &str) -> Result<Vec<FilmRef>, JobError> {
+        // what is of no band can only go when all bands have taken from it
+        let by_band: Vec<_> = self.by_band().collect();
+        let several = by_band.iter().any(|(band, _)| band.is_some());
+        let of_all = several && self.now.iter().any(|p| p.band.is_none());
+        let most = if several { MANY - 1 } else { 1 };
+        let (many, few): (Vec<_>, Vec<_>) = by_band.into_iter().partition(|(_, p)| of_all || p.len() > most);
+        let work = |(band, parts): (Option<u32>, Vec<FilmRef>)| {
+            let name = Some(band.map_or_else(|| name.to_owned(), |b| format!("{name}-b{b:05}")));
+            Work::Merge { name, parts, spp: 1, picture: None, band }
+        };
+        let mut now: Vec<FilmRef> = few.into_iter().flat_map(|(_, parts)| parts).collect();
+        for done in self.fleet.call_all(many.into_iter().map(work).collect())? {
+            let Done::Merged { film, .. } = done else { return Err(other()) };
+            now.extend(film);
         }
-        let film = self.merge(Some(name), 1, None)?.film;
-        self.now = film.iter().cloned().collect();
-        Ok(film)
+        self.now = now;
+        Ok(self.now.clone())
     }
     fn rel_mse(&mut self, spp: u32) -> Result<Option<f64>, JobError> {
-        if self.now.is_empty() {
+        // nothing to read for an error that there is not
+        if self.now.is_empty() || spp < 2 {
             return Ok(None);
         }
-        Ok(self.merge(None, spp, None)?.rel_mse)
+        if let Some((of, error)) = self.error
+            && of == spp
+        {
+            return Ok(error);
+        }
+        let error = self.look(spp)?;
+        self.error = Some((spp, error));
+        Ok(error)
     }
     fn on_store(&self, store: u32) -> Objects {
         let mut all: Objects = Vec::new();

@@ -19,7 +19,8 @@ use crate::local::nodes::placement;
 use crate::store::{BlockStore, NodeView, SceneObjects, check_key, object_key};
 use crate::textures::tile_holders;
 
-/// Prepares the scene of a checked job, unless it is prepared; its manifest, and whether it was there.
+/// Prepares the scene of a checked job, unless it is prepared; its manifest, whether it was there, and cells of volumes that were not
+/// looked into.
 ///
 /// `scratch` holds the source and the prepared objects on their way; what is left in it is deleted.
 pub fn prepare_scene(
@@ -28,7 +29,7 @@ pub fn prepare_scene(
     spec: &RenderJobSpec,
     replicas: u32,
     scratch: &Path,
-) -> Result<(ObjectRef, bool), JobError> {
+) -> Result<(ObjectRef, bool, u64), JobError> {
     let store = depot.replicated(replicas)?;
     let folder = scratch.join("source");
     // one copy: reading must not make more of what is not ours
@@ -79,7 +80,7 @@ pub fn prepare_scene(
         let io = |e| JobError::Settings(format!("cannot clean {}: {e}", folder.display()));
         fs::remove_dir_all(&folder).map_err(io)?;
     }
-    Ok((prepared.reference, prepared.reused))
+    Ok((prepared.reference, prepared.reused, records.cells_passed()))
 }
 
 /// Copies the source and what lies beside it from the storage; where it is now.

@@ -1,29 +1,29 @@
 //! A worker: slots that ask for work, do it next to their own store, and report.
 
 use std::collections::BTreeMap;
+use std::io::BufWriter;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
-use rayherd_render::film::FilmPart;
-use rayherd_render::frame::Frame;
+use rayherd_render::film::ErrorSum;
 use rayherd_scene::manifest::Manifest;
 use rayherd_scene::objects::{ObjectRef, ObjectStore};
 use tokio::runtime::Runtime;
 
 use super::Depot;
-use super::message::{Answer, Beat, Done, Failure, Poll, Report, Stage, Work, WorkerId};
+use super::bands::Adder;
+use super::message::{Answer, Beat, Done, Failure, Poll, Reads, Report, Stage, Work, WorkerId};
 use super::prepare::prepare_scene;
 use crate::job::spec::definition;
-use crate::job::{Image, JobError, JobSettings, NodeSpec, PreparedScene};
+use crate::job::{JobError, JobSettings, NodeSpec, PreparedScene};
 use crate::ledger::FilmRef;
-use crate::local::attempt::{self, Attempt, Shared};
+use crate::local::attempt::{self, Attempt, FilmUse, Shared};
 use crate::local::nodes::{Fetch, Nodes, Part, placement};
 use crate::local::slots::StopFlag;
 use crate::local::usage::thread_cpu;
-use crate::picture;
 use crate::report::{Bytes, Kind, Place};
 use crate::store::{SceneObjects, StoreError, object_key};
 use crate::task::{Stop, codec};
@@ -36,6 +36,8 @@ const PAUSE: Duration = Duration::from_millis(500);
 /// After work that did not come out for now, before more is asked for: doubled for each such failure in a row, up to the longest.
 const FIRST_REST: Duration = Duration::from_millis(125);
 const LONGEST_REST: Duration = Duration::from_secs(4);
+/// Film tiles that a task holds as sums: 96 MiB.
+const TILES: usize = 1024;
 /// How long a report is offered to an operator that does not answer.
 const PATIENCE: Duration = Duration::from_secs(120);
 
@@ -198,13 +200,13 @@ impl<'l> Station<'l> {
         let placement = placement(&scene, disks, stage.replicas);
         let near =
             Near { station: self, placement, replicas: stage.replicas, home: self.depot.home().filter(|_| stage.near) };
-        let nodes = Nodes::real(&scene, &settings, part, disks, Some(Box::new(near)))?;
+        let nodes = Nodes::real(&scene, &settings, part, disks, Some(Box::new(near)))?.noting_reads();
         let shared = Shared {
             scene: &scene,
             frame: &stage.frame,
             settings: &settings,
             nodes,
-            store_film: true,
+            film: FilmUse::Banded { band: stage.band, most: TILES },
             buckets: stage.buckets,
         };
         Ok(self.slots(Some(stage), Some(&shared)))
@@ -235,7 +237,7 @@ impl<'l> Station<'l> {
 
     fn slot(&self, stage: Option<&Stage>, shared: Option<&Shared>, clerk: bool) -> Next {
         let worker = self.worker.clone();
-        let poll = Poll { worker, home: self.depot.home(), stage: stage.map(|s| s.id.clone()), clerk };
+        let poll = Poll { worker, home: self.depot.home(), stage: stage.map(|s| s.id.clone()), clerk, bands: true };
         while !self.is_leaving() {
             match self.link.poll(&poll) {
                 Ok(Answer::Wait) => {}
@@ -262,6 +264,8 @@ impl<'l> Station<'l> {
             .unwrap_or_else(|_| Err(JobError::Internal("a task panicked".into())));
         let cpu = thread_cpu() - before;
         let result = result.map_err(|e| {
+            let no_bucket = if matches!(e, JobError::Stopped) { None } else { self.depot.without_bucket() };
+            let e = no_bucket.map_or(e, JobError::from);
             let failure = Failure::from(&e);
             if failure != Failure::Stopped {
                 tracing::warn!("{e}");
@@ -270,7 +274,9 @@ impl<'l> Station<'l> {
         });
         let rest = self.rest(&result);
         let bytes = shared.map_or_else(Bytes::default, |s| s.nodes.take_bytes()).rows();
-        let report = Report { worker: self.worker.clone(), id: id.clone(), result, cpu, bytes };
+        let (splits, tiles) = shared.map(|s| s.nodes.take_reads()).unwrap_or_default();
+        let reads = Reads { stage: stage.map(|s| s.id.clone()).unwrap_or_default(), splits, tiles };
+        let report = Report { worker: self.worker.clone(), id: id.clone(), result, cpu, bytes, reads };
         let since = Instant::now();
         while let Err(e) = self.link.report(&report) {
             tracing::warn!("{e}");
@@ -311,9 +317,9 @@ impl<'l> Station<'l> {
         let open = || stage.zip(shared).ok_or_else(|| JobError::Internal("work of a stage that is not open".into()));
         match work {
             Work::Prepare { spec, replicas } => {
-                let (scene, reused) =
+                let (scene, reused, cells_passed) =
                     prepare_scene(&self.depot, self.runtime.handle(), spec, *replicas, &self.scratch)?;
-                Ok(Done::Prepared { scene, reused })
+                Ok(Done::Prepared { scene, reused, cells_passed })
             }
             Work::Attempt { attempt } => {
                 let (_, shared) = open()?;
@@ -321,9 +327,17 @@ impl<'l> Station<'l> {
                 let made = attempt::run(shared, &attempt, stop)?;
                 Ok(Done::Made { outputs: made.outputs, hops: made.hops, skipped: made.skipped })
             }
-            Work::Merge { name, parts, spp, picture } => {
-                let (_, shared) = open()?;
-                self.merge(shared, name.as_deref(), parts, *spp, picture.as_deref())
+            Work::Merge { name, parts, spp, picture, band } => {
+                let (stage, shared) = open()?;
+                let read = |part: &FilmRef| {
+                    let open = |body: &bytes::Bytes| codec::open_film(stage.frame.size, body);
+                    shared.nodes.get(self.node(), Kind::Film, &part.key, &part.holders, open)
+                };
+                let adder = Adder { size: stage.frame.size, band: stage.band, read: &read };
+                match picture {
+                    Some(key) => self.picture(&adder, shared, parts, *spp, key),
+                    None => self.merge(&adder, shared, name.as_deref(), (parts, *band), *spp),
+                }
             }
             Work::Copy { objects, gone } => {
                 let (_, shared) = open()?;
@@ -368,48 +382,48 @@ impl<'l> Station<'l> {
 
     fn merge(
         &self,
+        adder: &Adder,
         shared: &Shared,
         name: Option<&str>,
-        parts: &[FilmRef],
+        (parts, band): (&[FilmRef], Option<u32>),
         spp: u32,
-        picture: Option<&str>,
     ) -> Result<Done, JobError> {
-        let (nodes, size) = (&shared.nodes, shared.frame.size);
-        let mut sum = FilmPart::new(size);
-        for part in parts {
-            let open = |body: &bytes::Bytes| codec::decode_film(size, body);
-            sum.merge(&nodes.get(self.node(), Kind::Film, &part.key, &part.holders, open)?)?;
-        }
+        let sum = adder.sum(parts, band)?;
         let film = match name {
             Some(key) if sum.touched() > 0 || sum.rejected().count > 0 => {
-                let body = codec::encode_film(&sum);
+                let body = codec::seal_film(&sum.encode());
                 let bytes = body.len() as u64;
-                let holders = nodes.put(self.node(), Kind::Film, key, body)?;
-                Some(FilmRef { key: key.to_owned(), bytes, holders })
+                let holders = shared.nodes.put(self.node(), Kind::Film, key, body)?;
+                Some(FilmRef { key: key.to_owned(), band, bytes, holders })
             }
             _ => None,
         };
-        let picture = picture.map(|key| self.write_picture(shared.scene, shared.frame, &sum, spp, key)).transpose()?;
         let non_finite = sum.rejected().keys.iter().copied().collect();
-        Ok(Done::Merged { film, rel_mse: sum.rel_mse(spp), non_finite, picture: picture.unwrap_or_default() })
+        Ok(merged(adder, film, sum.error_sum(spp), non_finite, Vec::new()))
     }
 
-    /// Writes the picture on the first stores that take it; where it lies.
-    fn write_picture(
+    /// Makes a picture in a file of our own, then puts it on the stores that take it.
+    fn picture(
         &self,
-        scene: &PreparedScene,
-        frame: &Frame,
-        sum: &FilmPart,
+        adder: &Adder,
+        shared: &Shared,
+        parts: &[FilmRef],
         spp: u32,
         key: &str,
-    ) -> Result<Vec<String>, JobError> {
-        let body = picture::encode(&image_of(sum, spp), &definition(&scene.manifest, frame, spp)?)?;
-        let body = bytes::Bytes::from(body);
+    ) -> Result<Done, JobError> {
+        let io = |e: std::io::Error| {
+            JobError::Settings(format!("cannot write a picture in {}: {e}; give it room", self.scratch.display()))
+        };
+        std::fs::create_dir_all(&self.scratch).map_err(io)?;
+        // gone with the value
+        let file = tempfile::NamedTempFile::new_in(&self.scratch).map_err(io)?;
+        let definition = definition(&shared.scene.manifest, shared.frame, spp)?;
+        let totals = adder.picture(parts, spp, &definition, BufWriter::new(file.as_file()))?;
         let mut at = Vec::new();
         let mut error = None;
         // on every store, so that each of them shows it
         for store in self.depot.stores() {
-            match self.runtime.block_on(store.put(key, body.clone())) {
+            match self.runtime.block_on(store.put_file(key, file.path())) {
                 Ok(()) => at.push(format!("{}/{key}", store.describe())),
                 Err(e) => {
                     tracing::warn!("{e}");
@@ -419,9 +433,20 @@ impl<'l> Station<'l> {
         }
         match error {
             Some(e) if at.is_empty() => Err(e.into()),
-            _ => Ok(at),
+            _ => Ok(merged(adder, None, totals.error, totals.non_finite.into_iter().collect(), at)),
         }
     }
+}
+
+/// What came out of adding up. The mean is for operators that know no bands.
+fn merged(
+    adder: &Adder,
+    film: Option<FilmRef>,
+    error: Option<ErrorSum>,
+    non_finite: Vec<(u32, u32)>,
+    picture: Vec<String>,
+) -> Done {
+    Done::Merged { film, rel_mse: error.map(|e| e.mean(adder.size)), error, non_finite, picture }
 }
 
 /// Reads blocks from the store at home first, then from where they belong, then from anywhere.
@@ -474,10 +499,4 @@ impl Fetch for Near<'_, '_> {
         }
         Err(error.map_or_else(|| JobError::Internal("no store was asked".into()), JobError::from))
     }
-}
-
-/// The picture of a film.
-fn image_of(film: &FilmPart, spp: u32) -> Image {
-    let [width, height] = film.size();
-    Image { width, height, pixels: film.resolve(spp) }
 }

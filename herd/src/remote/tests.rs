@@ -1,16 +1,18 @@
 //! Whole jobs over stores in memory: operator and workers in this process, the messages as they would go over the wire.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::atomic::{AtomicU32, Ordering};
 use std::sync::{Arc, LazyLock, Mutex};
 use std::time::{Duration, Instant};
 
 use rayherd_api::{RenderJobSpec, Strategy};
+use rayherd_render::skip::Skip;
 use rayherd_scene::import::{DescriptionSource, StreamOptions, import};
 use rayherd_scene::objects::{MemoryObjects, ObjectRef};
 use rayherd_scene::prepare::{NoProgress, SpoolSettings, prepare};
 use tokio::runtime::{Handle, Runtime};
 
+use super::bands::BAND;
 use super::frames::{Job, Keeper, run};
 use super::message::{Answer, Beat, Poll, Report, WorkerId};
 use super::{Depot, Fleet, Link, LinkError, Station, Turns};
@@ -124,6 +126,11 @@ fn spec(strategy: Strategy, splits: i64, replicas: i32) -> RenderJobSpec {
 
 /// The file that a local run would write.
 fn expected(spec: &RenderJobSpec) -> Vec<u8> {
+    local(spec).0
+}
+
+/// That file and the report of that run.
+fn local(spec: &RenderJobSpec) -> (Vec<u8>, report::Report) {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("box.xml");
     std::fs::write(&path, CORNELL.as_str()).unwrap();
@@ -137,7 +144,8 @@ fn expected(spec: &RenderJobSpec) -> Vec<u8> {
     let frame = from_spec::frame(spec, &scene.manifest, None).unwrap();
     let sampling = Sampling { spp: 6, target_error: None, time_limit: None };
     let out = render_local(&scene, &frame, &sampling, &JobSettings::default(), &Silent).unwrap();
-    picture::encode(&out.image, &from_spec::definition(&scene.manifest, &frame, out.spp).unwrap()).unwrap()
+    let file = picture::encode(&out.image, &from_spec::definition(&scene.manifest, &frame, out.spp).unwrap()).unwrap();
+    (file, out.report)
 }
 
 struct Cluster {
@@ -145,6 +153,8 @@ struct Cluster {
     runtime: Runtime,
     scratch: tempfile::TempDir,
     turns: Turns,
+    /// Tiles of a band, of four that the film has.
+    band: u32,
 }
 
 impl Cluster {
@@ -152,7 +162,8 @@ impl Cluster {
         let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build().unwrap();
         let memory = || Arc::new(Faulty::new(Arc::new(MemoryStore::default()), FaultPlan::default()));
         let stores = (0..nodes).map(|_| memory()).collect();
-        let cluster = Cluster { stores, runtime, scratch: tempfile::tempdir().unwrap(), turns: Turns::default() };
+        let cluster =
+            Cluster { stores, runtime, scratch: tempfile::tempdir().unwrap(), turns: Turns::default(), band: BAND };
         cluster.runtime.block_on(cluster.stores[0].put(SOURCE, CORNELL.clone().into())).unwrap();
         cluster.runtime.block_on(cluster.stores[0].put(TEXTURE, wall().into())).unwrap();
         cluster
@@ -174,6 +185,7 @@ impl Cluster {
             fleet,
             turns: &self.turns,
             slots: vec![1; 3],
+            band: self.band,
             runtime: self.runtime.handle().clone(),
         }
     }
@@ -243,20 +255,26 @@ fn wait_for(what: impl Fn() -> bool) {
 
 #[test]
 fn every_strategy_makes_the_bytes_of_a_local_run() {
-    for (strategy, splits, memory) in [
-        (Strategy::Auto, 1, None),
-        (Strategy::Auto, 6, Some("64Ki")),
-        (Strategy::DemandDriven, 4, None),
-        (Strategy::SchedulingGrid, 4, None),
-        (Strategy::SchedulingGridOverlapReduced, 4, None),
+    for (strategy, splits, memory, band) in [
+        (Strategy::Auto, 1, None, BAND),
+        (Strategy::Auto, 6, Some("64Ki"), 1),
+        (Strategy::DemandDriven, 4, None, 3),
+        (Strategy::SchedulingGrid, 4, None, 1),
+        (Strategy::SchedulingGridOverlapReduced, 4, None, BAND),
+        (Strategy::SchedulingGridOverlapReduced, 4, None, 2),
     ] {
         let mut spec = spec(strategy, splits, 2);
         spec.workers.memory = memory.map(|m: &str| m.parse().unwrap());
-        let (cluster, kept) = (Cluster::new(2), Arc::new(Kept::default()));
+        let (cluster, kept) = (Cluster { band, ..Cluster::new(2) }, Arc::new(Kept::default()));
         if let Err(e) = cluster.render(&spec, &kept) {
             panic!("{strategy}: {e}");
         }
-        assert!(cluster.picture(0) == expected(&spec), "{strategy}");
+        let (file, report) = local(&spec);
+        assert!(cluster.picture(0) == file, "{strategy}");
+        assert_eq!(kept.reports.lock().unwrap()[0].rel_mse, report.rel_mse, "exactly, whatever the bands");
+        // what was read by nobody, as the one process knows it; all of this scene is read
+        let skips = |of: &report::Report| [Skip::Splits, Skip::Textures].map(|s| of.skips[s.name()]);
+        assert_eq!(skips(&kept.reports.lock().unwrap()[0]), skips(&report));
         assert!(cluster.picture(1) == cluster.picture(0));
         let reports = kept.reports.lock().unwrap();
         assert!(reports[0].tasks > 1 && reports[0].scene_passes > 0.0, "{:?}", reports[0]);
@@ -276,6 +294,11 @@ fn a_scene_is_prepared_once_and_a_finished_job_is_not_done_again() {
     assert_eq!((reports[1].tasks, reports[1].tasks_reused), (0, reports[0].tasks), "all of it was in the ledger");
     let prepared = kept.prepared.lock().unwrap();
     assert!(!prepared[0].1 && prepared[1].1, "{prepared:?}");
+    // what was kept of it: world, four tiles, two objects of each split; and nothing was read the second time
+    let skips = |i: usize| [Skip::Prepared, Skip::Volume, Skip::Splits].map(|s| reports[i].skips[s.name()]);
+    let [kept_objects, cells, splits] = skips(1);
+    assert_eq!((skips(0)[0], skips(0)[1], cells, kept_objects), (0, 0, 0, 5 + 2 * splits));
+    assert!(splits >= 4 && skips(0)[2] < splits, "{splits}");
 }
 
 /// Pods of jobs that wait may take the room of the pod of the job that they wait for.
@@ -291,7 +314,7 @@ fn a_job_without_workers_keeps_no_other_from_preparing_their_scene() {
         let waits = scope.spawn(move || run(&cluster.job(spec, depot, first, "f"), &keeper, &Silent));
         // nor one whose worker was there, and is gone with the work in its hands
         let gone = WorkerId { number: 0, session: "gone".into() };
-        let poll = Poll { worker: gone.clone(), home: None, stage: None, clerk: false };
+        let poll = Poll { worker: gone.clone(), home: None, stage: None, clerk: false, bands: true };
         wait_for(|| matches!(first.answer(&poll), Ok(Answer::Work { .. })));
         first.gone(&gone);
         cluster.render(spec, &kept).unwrap();
@@ -354,8 +377,11 @@ fn an_unreadable_record_or_snapshot_costs_work_and_not_the_job() {
     spec.sampling.spp = Some(6);
     spec.task_seconds = Some(0.003);
     let want = expected(&spec);
-    for broken in ["the pointer's record", "the newest snapshot", "the newest snapshot's film", "all film"] {
-        let (cluster, kept) = (Cluster::new(3), Arc::new(Kept::default()));
+    let its_film = "the newest snapshot's film";
+    for (broken, band) in
+        [("the pointer's record", BAND), ("the newest snapshot", 1), (its_film, BAND), (its_film, 1), ("all film", 1)]
+    {
+        let (cluster, kept) = (Cluster { band, ..Cluster::new(3) }, Arc::new(Kept::default()));
         begun(&cluster, &spec, &kept, 40);
         let part = cluster.depot(None).part("jobs/1/0", 2).unwrap();
         let (sequence, name) = kept.newest(0).unwrap();
@@ -363,7 +389,7 @@ fn an_unreadable_record_or_snapshot_costs_work_and_not_the_job() {
         records.retain(|n, r| r.sequence < sequence || *n == name);
         let snapshots = records.iter().filter(|r| r.1.snapshot.is_some());
         let (snapshot, record) = snapshots.max_by_key(|r| r.1.sequence).expect("there are snapshots");
-        let film = record.snapshot.as_ref().and_then(|s| s.film.as_ref()).map(|f| f.key.as_str());
+        let film = record.snapshot.as_ref().and_then(|s| s.film.first()).map(|f| f.key.as_str());
         let wrong = match broken {
             "the pointer's record" => name.as_str(),
             "the newest snapshot" => snapshot.as_str(),
@@ -385,7 +411,44 @@ fn an_unreadable_record_or_snapshot_costs_work_and_not_the_job() {
         }
         assert!(cluster.picture(1) == want, "{broken}");
         let reports = kept.reports.lock().unwrap();
-        assert_eq!(reports[0].tasks_reused > 0, broken != "all film", "{broken}: {:?}", reports[0]);
+        // a part of a band may be named by the snapshot before as well: then there is nothing to go on from
+        let shared = broken == its_film && band == 1;
+        assert!(shared || (reports[0].tasks_reused > 0) == (broken != "all film"), "{broken}: {:?}", reports[0]);
+    }
+}
+
+/// A job that a version without bands has begun, whose film is stored as a whole, goes on by bands; and what it stores of its film does not
+/// pile up.
+#[test]
+fn a_film_that_was_stored_in_other_parts_goes_on() {
+    let mut spec = spec(Strategy::SchedulingGridOverlapReduced, 4, 2);
+    spec.task_seconds = Some(0.003);
+    let want = expected(&spec);
+    for (first, then) in [(BAND, 1), (BAND, 3), (BAND, BAND)] {
+        let (cluster, kept) = (Cluster { band: first, ..Cluster::new(3) }, Arc::new(Kept::default()));
+        begun(&cluster, &spec, &kept, 30);
+        let cluster = Cluster { band: then, ..cluster };
+        if let Err(e) = cluster.render(&spec, &kept) {
+            panic!("{first} {then}: {e}");
+        }
+        assert!(cluster.picture(1) == want, "{first} {then}");
+        let reports = kept.reports.lock().unwrap();
+        assert!(reports[0].tasks_reused > 0 && reports[0].tasks_redone == 0, "{:?}", reports[0]);
+        let part = cluster.depot(None).part("jobs/1/0", 2).unwrap();
+        let records = cluster.runtime.block_on(journal::read(&part)).unwrap();
+        let bands: BTreeSet<Option<u32>> = records
+            .values()
+            .max_by_key(|r| r.sequence)
+            .and_then(|r| Some(r.snapshot.as_ref()?.film.iter().map(|f| f.band).collect()))
+            .expect("a job ends with a snapshot");
+        let all = (0..4u32.div_ceil(then)).map(|b| (then < 4).then_some(b)).collect();
+        assert_eq!(bands, all);
+        // parts that were added up are deleted, all but those of the last snapshots and of the last state without rays on their way
+        for store in &cluster.stores {
+            let lie = cluster.runtime.block_on(store.list("jobs/1/0/film/")).unwrap().len() as u64;
+            println!("{first} {then}: {lie} film objects, {} tasks", reports[0].tasks);
+            assert!(lie * 3 < reports[0].tasks, "{lie} of {}", reports[0].tasks);
+        }
     }
 }
 
@@ -397,12 +460,13 @@ fn a_worker_that_comes_back_under_another_session_loses_only_its_tasks() {
         home: None,
         stage: None,
         clerk: false,
+        bands: true,
     };
     assert_eq!(fleet.answer(&poll("a")), Ok(Answer::Wait));
     let stranger = Poll { worker: WorkerId { number: 1, session: "a".into() }, ..poll("a") };
     assert!(fleet.answer(&stranger).is_err());
     std::thread::scope(|scope| {
-        let work = super::Work::Merge { name: None, parts: vec![], spp: 1, picture: None };
+        let work = super::Work::Merge { name: None, parts: vec![], spp: 1, picture: None, band: None };
         let call = scope.spawn(|| fleet.call(work));
         let handed = |session: &str| {
             let since = Instant::now();
@@ -420,9 +484,16 @@ fn a_worker_that_comes_back_under_another_session_loses_only_its_tasks() {
         let report = |session: &str, id: &str, rel_mse| Report {
             worker: WorkerId { number: 0, session: session.into() },
             id: id.into(),
-            result: Ok(super::message::Done::Merged { film: None, rel_mse, non_finite: vec![], picture: vec![] }),
+            result: Ok(super::message::Done::Merged {
+                film: None,
+                rel_mse,
+                error: None,
+                non_finite: vec![],
+                picture: vec![],
+            }),
             cpu: 0.0,
             bytes: vec![],
+            reads: Default::default(),
         };
         assert_eq!(fleet.report(report("b", &first, Some(1.0))), Ok(false), "its id is known no more");
         assert_eq!(fleet.report(report("b", "other-0", Some(2.0))), Ok(false));
@@ -436,6 +507,39 @@ fn a_worker_that_comes_back_under_another_session_loses_only_its_tasks() {
     // the loop over rounds learns that the one that came back holds nothing
     let told = fleet.next(Duration::ZERO).unwrap();
     assert!(matches!(told, Some(Event::MemoryLost(0))) && fleet.next(Duration::ZERO).unwrap().is_none());
+}
+
+/// Workers of a version without bands would add the whole of a part to each band: as long as one is there, films are added up whole, and
+/// it gets nothing else.
+#[test]
+fn a_worker_that_knows_no_bands_is_given_none() {
+    let fleet = Fleet::new(2, "e");
+    let poll = |number: u32, bands: bool| {
+        let worker = WorkerId { number, session: "a".into() };
+        let text = serde_json::to_value(Poll { worker, home: None, stage: None, clerk: false, bands }).unwrap();
+        // as it is written where the word is not known
+        let serde_json::Value::Object(mut map) = text else { unreachable!() };
+        if !bands {
+            map.remove("bands");
+        }
+        serde_json::from_value::<Poll>(map.into()).unwrap()
+    };
+    assert!(fleet.knows_bands());
+    let merge = |band| super::Work::Merge { name: None, parts: vec![], spp: 1, picture: None, band };
+    let given = |number, bands| match fleet.answer(&poll(number, bands)).unwrap() {
+        Answer::Work { work, .. } => Some(*work),
+        _ => None,
+    };
+    std::thread::scope(|scope| {
+        let call = scope.spawn(|| fleet.call_all(vec![merge(Some(0)), merge(None)]));
+        let old = std::cell::OnceCell::new();
+        wait_for(|| given(0, false).is_some_and(|work| old.set(work).is_ok()));
+        assert_eq!(old.get(), Some(&merge(None)));
+        assert!(!fleet.knows_bands());
+        assert_eq!((given(0, false), given(1, true)), (None, Some(merge(Some(0)))));
+        fleet.cancel("enough");
+        assert!(matches!(call.join().unwrap(), Err(JobError::Owned(_))));
+    });
 }
 
 #[test]
@@ -490,6 +594,47 @@ fn a_machine_whose_plug_is_pulled_costs_its_copies_and_no_byte() {
 }
 
 #[test]
+fn a_server_that_comes_back_without_its_bucket_costs_its_copies_and_no_byte() {
+    let mut spec = spec(Strategy::SchedulingGridOverlapReduced, 4, 2);
+    spec.task_seconds = Some(0.003);
+    let (cluster, kept) = (Cluster::new(3), Arc::new(Kept::default()));
+    let done = cluster.beside(
+        (&spec, &kept, "e"),
+        // far longer than the test may take: it is no silence
+        |job| Job { patience: Duration::from_secs(3600), ..job },
+        |_, _| {
+            wait_for(|| kept.newest(0).is_some_and(|p| p.0 >= 3));
+            cluster.stores[1].empty();
+        },
+    );
+    if let Err(e) = done {
+        panic!("{e}");
+    }
+    let want = expected(&spec);
+    assert!(cluster.picture(2) == want);
+    assert_eq!(kept.reports.lock().unwrap()[0].tasks_redone, 0);
+    let below = kept.below.lock().unwrap().clone();
+    assert!(below[0].as_ref().is_some_and(|m| m.contains("store 1 has lost its bucket")), "{below:?}");
+    assert_eq!(below.last(), Some(&None), "all was copied: {below:?}");
+    let objects = |store: usize| cluster.runtime.block_on(cluster.stores[store].list("objects/")).unwrap();
+    assert!(objects(0).len() > 8 && objects(0) == objects(2));
+    // another job begins beside it, its scene prepared anew; and with its bucket it is a server again
+    let other = RenderJobSpec { splits: Some(3), ..spec.clone() };
+    let kept = Arc::new(Kept::default());
+    cluster.beside((&other, &kept, "f"), |job| Job { prefix: "jobs/2".into(), ..job }, |_, _| {}).unwrap();
+    assert!(!kept.prepared.lock().unwrap()[0].1);
+    cluster.stores[1].restore(Some(Arc::new(MemoryStore::default())));
+    let kept = Arc::new(Kept::default());
+    cluster.beside((&spec, &kept, "g"), |job| Job { prefix: "jobs/3".into(), ..job }, |_, _| {}).unwrap();
+    assert!(cluster.picture(1) == want);
+    // nobody has it: that is said, and at once
+    cluster.stores.iter().for_each(|s| s.empty());
+    let kept = Arc::new(Kept::default());
+    let said = cluster.beside((&spec, &kept, "h"), |job| Job { prefix: "jobs/4".into(), ..job }, |_, _| {});
+    assert!(said.unwrap_err().to_string().contains("none of the job's servers has the bucket"));
+}
+
+#[test]
 fn a_job_whose_scene_is_known_needs_its_source_no_more() {
     let spec = spec(Strategy::Auto, 4, 2);
     let (cluster, kept) = (Cluster::new(3), Arc::new(Kept::default()));
@@ -511,7 +656,7 @@ fn workers_that_wait_are_sent_to_the_next_fleet_at_once() {
     let runtime = Runtime::new().unwrap();
     let fleet = Fleet::new(1, "e");
     let worker = WorkerId { number: 0, session: "a".into() };
-    let poll = Poll { worker, home: None, stage: None, clerk: false };
+    let poll = Poll { worker, home: None, stage: None, clerk: false, bands: true };
     // far longer than a test may take
     let waits = runtime.block_on(async {
         let waiting = fleet.poll(&poll, Duration::from_secs(3600));

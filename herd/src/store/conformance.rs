@@ -12,6 +12,7 @@ use super::{BlockStore, StoreError};
 pub async fn conformance(store: &dyn BlockStore) {
     remove(store, "conformance/").await;
     reads_back_what_was_put(store).await;
+    reads_back_what_a_file_held(store).await;
     replaces(store).await;
     says_not_found(store).await;
     refuses_invalid_keys(store).await;
@@ -35,6 +36,20 @@ async fn reads_back_what_was_put(store: &dyn BlockStore) {
     let sizes = [("conformance/body/empty", 0), ("conformance/body/large", 8 << 20), ("conformance/body/one", 1)];
     assert_eq!(found, sizes.map(|(k, n)| (k.to_owned(), n)));
     remove(store, "conformance/body/").await;
+}
+
+async fn reads_back_what_a_file_held(store: &dyn BlockStore) {
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("file");
+    for length in [0, 5, (3 << 20) + 1] {
+        let body = pattern(length, 2);
+        std::fs::write(&file, &body).unwrap();
+        let key = "conformance/file";
+        store.put_file(key, &file).await.unwrap();
+        assert!(store.get(key).await.unwrap() == body, "{length}");
+        store.delete(&[key.to_owned()]).await.unwrap();
+    }
+    assert!(store.put_file("conformance/file", &folder.path().join("none")).await.is_err());
 }
 
 async fn replaces(store: &dyn BlockStore) {

@@ -66,6 +66,7 @@ pub struct Faulty {
     plan: FaultPlan,
     lost: AtomicBool,
     hangs: AtomicBool,
+    emptied: AtomicBool,
     hung: AtomicU64,
     state: Mutex<State>,
 }
@@ -93,6 +94,7 @@ impl Faulty {
             plan,
             lost: AtomicBool::new(false),
             hangs: AtomicBool::new(false),
+            emptied: AtomicBool::new(false),
             hung: AtomicU64::new(0),
             state: Mutex::default(),
         }
@@ -108,7 +110,13 @@ impl Faulty {
         if let Some(disk) = disk {
             *self.inner.write().unwrap_or_else(PoisonError::into_inner) = disk;
         }
+        self.emptied.store(false, Ordering::SeqCst);
         self.lost.store(false, Ordering::SeqCst);
+    }
+
+    /// From now on there is no bucket, as when a server is back with another disk.
+    pub fn empty(&self) {
+        self.emptied.store(true, Ordering::SeqCst);
     }
 
     /// From now on operations do not end, as when the plug of its machine is pulled; or they do again.
@@ -168,6 +176,9 @@ impl Faulty {
         }
         if self.is_lost() {
             return Err(self.unavailable(action, key, "the node is lost"));
+        }
+        if self.emptied.load(Ordering::SeqCst) {
+            return Err(StoreError::NoBucket { store: self.describe(), bucket: "test".to_owned() });
         }
         if fault == Fault::Unavailable {
             return Err(self.unavailable(action, key, "injected"));

@@ -18,6 +18,8 @@ mod spilling;
 mod temporary;
 mod watched;
 
+use std::path::Path;
+
 use async_trait::async_trait;
 use bytes::Bytes;
 
@@ -46,6 +48,11 @@ pub use watched::{Patience, Pulse, TcpPulse, Watched};
 pub trait BlockStore: Send + Sync {
     /// Stores an object.
     async fn put(&self, key: &str, body: Bytes) -> Result<(), StoreError>;
+    /// Stores the content of a file, which must not change meanwhile. Backends for which it matters do not hold it in memory.
+    async fn put_file(&self, key: &str, file: &Path) -> Result<(), StoreError> {
+        let body = tokio::fs::read(file).await.map_err(|e| unreadable(self.describe(), file, &e))?;
+        self.put(key, body.into()).await
+    }
     /// Reads a whole object.
     async fn get(&self, key: &str) -> Result<Bytes, StoreError>;
     /// Size of an object in bytes, `None` when there is none.
@@ -56,6 +63,10 @@ pub trait BlockStore: Send + Sync {
     async fn delete(&self, keys: &[String]) -> Result<(), StoreError>;
     /// Where this is, for messages: `s3://bucket/prefix`, a folder, `memory`.
     fn describe(&self) -> String;
+}
+
+fn unreadable(store: String, file: &Path, e: &std::io::Error) -> StoreError {
+    StoreError::Misconfigured { store, message: format!("cannot read {}, which is to be put: {e}", file.display()) }
 }
 
 /// Why a store did not do it, named by what the caller can do.
@@ -121,6 +132,14 @@ pub enum StoreError {
         /// What is wrong, and what to do.
         message: String,
     },
+    /// The server has no such bucket, and so none of what was in it: create it.
+    #[error("{store}: there is no bucket {bucket}: create it")]
+    NoBucket {
+        /// Which store.
+        store: String,
+        /// Which bucket.
+        bucket: String,
+    },
     /// The key breaks the rules.
     #[error("{key:?} is no valid key: {message}")]
     InvalidKey {
@@ -141,6 +160,7 @@ impl StoreError {
             | StoreError::Denied { .. }
             | StoreError::Corrupt { .. }
             | StoreError::InvalidKey { .. }
+            | StoreError::NoBucket { .. }
             | StoreError::Misconfigured { .. } => true,
         }
     }

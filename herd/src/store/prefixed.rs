@@ -1,5 +1,6 @@
 //! A part of a store as a store: what lies below one prefix.
 
+use std::path::Path;
 use std::sync::Arc;
 
 use async_trait::async_trait;
@@ -40,7 +41,7 @@ impl Prefixed {
             StoreError::Full { store, key, bytes } => StoreError::Full { store, key: own(key), bytes },
             StoreError::Corrupt { store, key, message } => StoreError::Corrupt { store, key: own(key), message },
             StoreError::InvalidKey { key, message } => StoreError::InvalidKey { key: own(key), message },
-            error @ StoreError::Misconfigured { .. } => error,
+            error @ (StoreError::Misconfigured { .. } | StoreError::NoBucket { .. }) => error,
         }
     }
 }
@@ -50,6 +51,11 @@ impl BlockStore for Prefixed {
     async fn put(&self, key: &str, body: Bytes) -> Result<(), StoreError> {
         check_key(key)?;
         self.inner.put(&self.path(key), body).await.map_err(|e| self.own(e))
+    }
+
+    async fn put_file(&self, key: &str, file: &Path) -> Result<(), StoreError> {
+        check_key(key)?;
+        self.inner.put_file(&self.path(key), file).await.map_err(|e| self.own(e))
     }
 
     async fn get(&self, key: &str) -> Result<Bytes, StoreError> {

@@ -1,6 +1,7 @@
 //! Tries again what may work later.
 
 use std::hash::{BuildHasher, RandomState};
+use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
@@ -85,6 +86,10 @@ impl Retrying {
 impl BlockStore for Retrying {
     async fn put(&self, key: &str, body: Bytes) -> Result<(), StoreError> {
         self.retry(|| self.inner.put(key, body.clone())).await
+    }
+
+    async fn put_file(&self, key: &str, file: &Path) -> Result<(), StoreError> {
+        self.retry(|| self.inner.put_file(key, file)).await
     }
 
     async fn get(&self, key: &str) -> Result<Bytes, StoreError> {

@@ -2,6 +2,9 @@
 //!
 //! Plain S3 and nothing newer than what MinIO of 2021 has: one put, get, head, list (version 2) and batch delete.
 
+use std::fs::File;
+use std::io::Read;
+use std::path::Path;
 use std::time::Duration;
 
 use async_trait::async_trait;
@@ -211,9 +214,7 @@ impl S3Store {
     ) -> StoreError {
         let store = self.name.clone();
         match (code, status) {
-            ("NoSuchBucket", _) => {
-                StoreError::Misconfigured { store, message: format!("there is no bucket {}: create it", self.bucket) }
-            }
+            ("NoSuchBucket", _) => StoreError::NoBucket { store, bucket: self.bucket.clone() },
             ("NoSuchKey" | "NotFound", _) => StoreError::NotFound { store, key },
             // MinIO on a file system
             ("XMinioParentIsObject" | "XMinioObjectExistsAsDirectory", _) => {
@@ -240,6 +241,14 @@ impl S3Store {
             }
             _ => StoreError::Denied { store, action, key, message },
         }
+    }
+
+    fn check_size(&self, key: &str, bytes: u64) -> Result<(), StoreError> {
+        if bytes <= LARGEST {
+            return Ok(());
+        }
+        let message = format!("{bytes} bytes, and S3 takes at most {LARGEST} in one put: use smaller blocks");
+        Err(StoreError::Denied { store: self.name.clone(), action: "put", key: key.to_owned(), message })
     }
 
     fn broken(&self, action: &'static str, key: &str, message: impl Into<String>) -> StoreError {
@@ -279,16 +288,29 @@ impl BlockStore for S3Store {
     async fn put(&self, key: &str, body: Bytes) -> Result<(), StoreError> {
         check_key(key)?;
         let bytes = body.len() as u64;
-        if bytes > LARGEST {
-            let message = format!("{bytes} bytes, and S3 takes at most {LARGEST} in one put: use smaller blocks");
-            return Err(StoreError::Denied { store: self.name.clone(), action: "put", key: key.to_owned(), message });
-        }
+        self.check_size(key, bytes)?;
         let request = self.client.put_object().bucket(&self.bucket).key(self.path(key)).body(ByteStream::from(body));
-        // the answer comes after the whole body: time for a slow line
-        let patience = Duration::from_secs(ANSWER_SECONDS + bytes / SLOWEST);
-        let timeouts = TimeoutConfig::builder().connect_timeout(CONNECT).read_timeout(patience).build();
-        let request = request.customize().config_override(aws_sdk_s3::Config::builder().timeout_config(timeouts));
+        let request = request.customize().config_override(patient(bytes));
         request.send().await.map(drop).map_err(|e| self.failure("put", key, bytes, e))
+    }
+
+    async fn put_file(&self, key: &str, file: &Path) -> Result<(), StoreError> {
+        check_key(key)?;
+        let failed = |e: &std::io::Error| super::unreadable(self.describe(), file, e);
+        let path = file.to_owned();
+        let summed = tokio::task::spawn_blocking(move || sum_of(&path)).await;
+        let (bytes, sum) = summed.map_err(|e| self.broken("put", key, e.to_string()))?.map_err(|e| failed(&e))?;
+        self.check_size(key, bytes)?;
+        let body = ByteStream::from_path(file).await.map_err(|e| failed(&std::io::Error::other(e)))?;
+        // what is sent in parts is not signed, so the server is told what to expect
+        let request = self.client.put_object().bucket(&self.bucket).key(self.path(key)).body(body).content_md5(sum);
+        request
+            .customize()
+            .config_override(patient(bytes))
+            .send()
+            .await
+            .map(drop)
+            .map_err(|e| self.failure("put", key, bytes, e))
     }
 
     async fn get(&self, key: &str) -> Result<Bytes, StoreError> {
@@ -383,6 +405,28 @@ impl BlockStore for S3Store {
 
     fn describe(&self) -> String {
         self.name.clone()
+    }
+}
+
+/// Settings for a put of so many bytes: its answer comes after the whole body, which takes its time on a slow line.
+fn patient(bytes: u64) -> aws_sdk_s3::config::Builder {
+    let patience = Duration::from_secs(ANSWER_SECONDS + bytes / SLOWEST);
+    let timeouts = TimeoutConfig::builder().connect_timeout(CONNECT).read_timeout(patience).build();
+    aws_sdk_s3::Config::builder().timeout_config(timeouts)
+}
+
+/// Size of a file, and the Content-MD5 of what it holds.
+fn sum_of(file: &Path) -> std::io::Result<(u64, String)> {
+    let mut file = File::open(file)?;
+    let (mut sum, mut bytes, mut part) = (Md5::new(), 0, vec![0; 1 << 20]);
+    loop {
+        match file.read(&mut part)? {
+            0 => return Ok((bytes, aws_smithy_types::base64::encode(sum.finalize()))),
+            n => {
+                bytes += n as u64;
+                sum.update(&part[..n]);
+            }
+        }
     }
 }
 

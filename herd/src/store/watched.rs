@@ -3,7 +3,11 @@
 //! A server that is gone refuses connections, which costs nothing. A machine whose plug is pulled does not even do that: each request
 //! would wait for its time-out, on a connection that is open still, and a job that asks it at every step would not come to its end. So
 //! who waits long for an answer takes the machine's pulse beside it, and what has none is not asked until it has one again.
+//!
+//! A server that has come back with another disk has not even the bucket. It holds nothing then, and says so: reads go to other copies. Nor
+//! does it take anything, until somebody makes the bucket again.
 
+use std::path::Path;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
@@ -73,7 +77,12 @@ struct Silence {
     /// When to look again.
     next: Instant,
     why: String,
+    /// It answers, and its bucket is gone.
+    emptied: bool,
 }
+
+/// Below this nothing lies: whether there is a bucket is asked so.
+const PROBE: &str = "rayherd-bucket-probe/";
 
 impl Watched {
     /// Around a store, which is taken to answer until it does not.
@@ -84,6 +93,11 @@ impl Watched {
     /// For how long it has been known to be silent; none if it answers, as far as is known.
     pub fn silent_for(&self) -> Option<Duration> {
         self.lock().as_ref().map(|s| s.since.elapsed())
+    }
+
+    /// Whether it was seen last without its bucket.
+    pub fn is_emptied(&self) -> bool {
+        self.lock().as_ref().is_some_and(|s| s.emptied)
     }
 
     /// Takes the pulse of a machine that is known to be silent, when it is time to; so that whoever has nothing to ask it learns that it
@@ -98,12 +112,12 @@ impl Watched {
     }
 
     /// Whether to ask at all; else why not.
-    async fn admit(&self) -> Result<(), String> {
+    async fn admit(&self) -> Result<(), Silence> {
         {
             let mut silence = self.lock();
             let Some(s) = silence.as_mut() else { return Ok(()) };
             if Instant::now() < s.next {
-                return Err(s.why.clone());
+                return Err(s.clone());
             }
             // this request looks, others are refused meanwhile
             s.next = Instant::now() + self.patience.pause;
@@ -111,73 +125,115 @@ impl Watched {
         self.look_now().await
     }
 
-    async fn look_now(&self) -> Result<(), String> {
-        let found = self.pulse.take().await;
-        let mut silence = self.lock();
-        match &found {
+    async fn look_now(&self) -> Result<(), Silence> {
+        let found = match self.pulse.take().await {
+            Err(why) => Err((why, false)),
+            // its server may be without its bucket still
+            Ok(()) if self.is_emptied() => match timeout(self.patience.answer, self.inner.list(PROBE)).await {
+                Ok(Ok(_)) => Ok(()),
+                Ok(Err(e)) => Err((e.to_string(), true)),
+                Err(_) => Err(("whether its bucket is there is not known".to_owned(), true)),
+            },
+            Ok(()) => Ok(()),
+        };
+        match found {
             Ok(()) => {
-                if let Some(s) = silence.take() {
+                if let Some(s) = self.lock().take() {
                     tracing::info!("{} answers again after {:?}", self.inner.describe(), s.since.elapsed());
                 }
+                Ok(())
             }
-            Err(why) => {
-                let now = Instant::now();
-                let since = silence.as_ref().map_or(now, |s| s.since);
-                if silence.is_none() {
-                    tracing::warn!("{} is silent: {why}; it is left out", self.inner.describe());
-                }
-                *silence = Some(Silence { since, next: now + self.patience.pause, why: why.clone() });
-            }
+            Err((why, emptied)) => Err(self.leave_out(why, emptied)),
         }
-        found
     }
 
+    /// Notes why it is not asked.
+    fn leave_out(&self, why: String, emptied: bool) -> Silence {
+        let mut silence = self.lock();
+        let now = Instant::now();
+        let since = silence.as_ref().map_or(now, |s| s.since);
+        if silence.as_ref().is_none_or(|s| s.emptied != emptied) {
+            let what = if emptied { "has lost what it held" } else { "is silent" };
+            tracing::warn!("{} {what}: {why}; it is left out", self.inner.describe());
+        }
+        silence.insert(Silence { since, next: now + self.patience.pause, why, emptied }).clone()
+    }
+
+    /// Asks; none when the server holds nothing.
     async fn ask<T>(
         &self,
         action: &'static str,
         key: &str,
         request: impl Future<Output = Result<T, StoreError>> + Send,
-    ) -> Result<T, StoreError> {
-        let silent = |why: String| {
-            let message = format!("its machine is silent: {why}");
-            StoreError::Unavailable { store: self.inner.describe(), action, key: key.to_owned(), message }
+    ) -> Result<Option<T>, StoreError> {
+        let refuse = |s: Silence| {
+            if s.emptied {
+                return Ok(None);
+            }
+            let message = format!("its machine is silent: {}", s.why);
+            Err(StoreError::Unavailable { store: self.inner.describe(), action, key: key.to_owned(), message })
         };
-        self.admit().await.map_err(silent)?;
+        if let Err(silence) = self.admit().await {
+            return refuse(silence);
+        }
         tokio::pin!(request);
         loop {
-            match timeout(self.patience.answer, &mut request).await {
-                Ok(Err(e @ StoreError::Unavailable { .. })) => {
-                    // a server that is there and busy is no silent machine
-                    let _ = self.look_now().await;
-                    return Err(e);
-                }
-                Ok(done) => return done,
+            let done = match timeout(self.patience.answer, &mut request).await {
+                Ok(done) => done,
                 Err(_) => tokio::select! {
                     biased;
-                    done = &mut request => return done,
-                    found = self.look_now() => found.map_err(silent)?,
+                    done = &mut request => done,
+                    found = self.look_now() => match found {
+                        Ok(()) => continue,
+                        Err(silence) => return refuse(silence),
+                    },
                 },
-            }
+            };
+            return match done {
+                Err(e @ StoreError::NoBucket { .. }) => {
+                    self.leave_out(e.to_string(), true);
+                    Ok(None)
+                }
+                Err(e @ StoreError::Unavailable { .. }) => {
+                    // a server that is there and busy is no silent machine
+                    let _ = self.look_now().await;
+                    Err(e)
+                }
+                done => done.map(Some),
+            };
         }
+    }
+
+    /// Of what it would have to take.
+    fn without_bucket(&self, action: &'static str, key: &str) -> StoreError {
+        let message = self.lock().as_ref().map_or_else(|| "its bucket is gone".to_owned(), |s| s.why.clone());
+        StoreError::Unavailable { store: self.inner.describe(), action, key: key.to_owned(), message }
     }
 }
 
 #[async_trait]
 impl BlockStore for Watched {
     async fn put(&self, key: &str, body: Bytes) -> Result<(), StoreError> {
-        self.ask("put", key, self.inner.put(key, body)).await
+        let put = self.ask("put", key, self.inner.put(key, body)).await?;
+        put.ok_or_else(|| self.without_bucket("put", key))
+    }
+    async fn put_file(&self, key: &str, file: &Path) -> Result<(), StoreError> {
+        let put = self.ask("put", key, self.inner.put_file(key, file)).await?;
+        put.ok_or_else(|| self.without_bucket("put", key))
     }
     async fn get(&self, key: &str) -> Result<Bytes, StoreError> {
-        self.ask("get", key, self.inner.get(key)).await
+        let none = || StoreError::NotFound { store: self.inner.describe(), key: key.to_owned() };
+        self.ask("get", key, self.inner.get(key)).await?.ok_or_else(none)
     }
     async fn size(&self, key: &str) -> Result<Option<u64>, StoreError> {
-        self.ask("size", key, self.inner.size(key)).await
+        Ok(self.ask("size", key, self.inner.size(key)).await?.flatten())
     }
     async fn list(&self, prefix: &str) -> Result<Vec<(String, u64)>, StoreError> {
-        self.ask("list", prefix, self.inner.list(prefix)).await
+        Ok(self.ask("list", prefix, self.inner.list(prefix)).await?.unwrap_or_default())
     }
     async fn delete(&self, keys: &[String]) -> Result<(), StoreError> {
-        self.ask("delete", keys.first().map_or("", String::as_str), self.inner.delete(keys)).await
+        // what is gone with the bucket need not be deleted
+        self.ask("delete", keys.first().map_or("", String::as_str), self.inner.delete(keys)).await.map(drop)
     }
     fn describe(&self) -> String {
         self.inner.describe()
@@ -228,6 +284,35 @@ mod tests {
             tokio::time::sleep(Duration::from_millis(5)).await;
         }
         assert_eq!(store.silent_for(), None);
+    }
+
+    #[tokio::test]
+    async fn a_server_without_its_bucket_holds_nothing_and_takes_nothing_until_it_has_one() {
+        let (faulty, store) = watched();
+        let body = Bytes::from_static(b"body");
+        store.put("a", body.clone()).await.unwrap();
+        faulty.empty();
+        assert!(matches!(store.get("a").await, Err(StoreError::NotFound { .. })));
+        assert!(store.is_emptied() && store.silent_for().is_some());
+        assert_eq!((store.size("a").await.unwrap(), store.list("").await.unwrap()), (None, vec![]));
+        store.delete(&["a".to_owned()]).await.unwrap();
+        let error = store.put("a", body.clone()).await.unwrap_err();
+        assert!(matches!(error, StoreError::Unavailable { .. }), "another one may take it");
+        assert!(error.to_string().contains("there is no bucket test: create it"), "{error}");
+        // its machine goes, and comes back as it was
+        faulty.hang(true);
+        tokio::time::sleep(2 * SOON.pause).await;
+        assert!(matches!(store.get("a").await, Err(StoreError::Unavailable { .. })));
+        assert!(!store.is_emptied());
+        faulty.hang(false);
+        faulty.restore(Some(Arc::new(MemoryStore::new())));
+        let mut tries = 0;
+        while store.put("a", body.clone()).await.is_err() {
+            tries += 1;
+            assert!(tries < 1000, "it is not asked again");
+            tokio::time::sleep(Duration::from_millis(5)).await;
+        }
+        assert_eq!((store.is_emptied(), store.silent_for()), (false, None));
     }
 
     #[tokio::test]

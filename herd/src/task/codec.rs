@@ -24,13 +24,14 @@ pub fn check_rays(scene: &PreparedScene, rays: &Flights) -> Result<(), WireError
     Ok(())
 }
 
-/// A film part as an object.
-pub fn encode_film(film: &FilmPart) -> Bytes {
-    seal(Kind::FilmPart, &film.encode(), Compress::Lz4)
+/// An encoded film part as an object.
+pub fn seal_film(part: &[u8]) -> Bytes {
+    seal(Kind::FilmPart, part, Compress::Lz4)
 }
 
-/// A film part from an object.
-pub fn decode_film(size: [u32; 2], body: &[u8]) -> Result<FilmPart, WireError> {
-    let payload = open(Kind::FilmPart, body, film_limit(size))?;
-    FilmPart::decode(&payload, size).map_err(|e| WireError::corrupt(e.to_string()))
+/// An encoded film part from an object, checked: [`FilmPart::add_encoded`] takes it.
+pub fn open_film(size: [u32; 2], body: &[u8]) -> Result<Vec<u8>, WireError> {
+    let part = open(Kind::FilmPart, body, film_limit(size))?;
+    FilmPart::check(&part, size).map_err(|e| WireError::corrupt(e.to_string()))?;
+    Ok(part)
 }

@@ -4,7 +4,7 @@
 //! is in memory is bounded by the batch and the siblings of a first hit, not by the task.
 
 use rayherd_render::bvh::{Kernel, Tracer, UnsupportedKernel};
-use rayherd_render::film::FilmPart;
+use rayherd_render::film::BoundedFilm;
 use rayherd_render::path::{Context, Outcome, PathRay, Surface, Surfaces, shade, shade_traced};
 use rayherd_render::ray::{Hit, MISS, PrimId, Ray};
 use rayherd_render::skip::{Skip, SkipCounts, Skips};
@@ -109,7 +109,7 @@ impl Loop {
         shading: &S,
         flights: &mut Flights,
         camera: &mut CameraFeed,
-        film: &mut FilmPart,
+        film: &mut BoundedFilm,
         stop: &dyn Stop,
     ) -> Result<(), JobError> {
         let forest = resident.forest();
@@ -148,14 +148,14 @@ impl Loop {
     }
 
     /// Adds what was shaded to the film, and counts the rays that it made.
-    fn collect(&mut self, film: &mut FilmPart) {
+    fn collect(&mut self, film: &mut BoundedFilm) {
         film.add_all(self.outcome.light.drain(..).map(|l| (l.pixel, l.sample, l.value)));
         self.rays.closest += self.outcome.next.len() as u64;
         self.rays.shadow += self.outcome.shadow.len() as u64;
     }
 
     /// Traces the shadow rays of the last batch where nothing else can be in the way.
-    fn occlude(&mut self, resident: &Resident, film: &mut FilmPart) {
+    fn occlude(&mut self, resident: &Resident, film: &mut BoundedFilm) {
         let (shadows, rays) = (&mut self.outcome.shadow, &mut self.outcome.shadow_rays);
         self.occluded.resize(shadows.len(), false);
         self.tracer.any(resident.forest(), rays, &mut self.occluded);
@@ -174,7 +174,7 @@ impl Loop {
         shading: &S,
         flights: &mut Flights,
         camera: &mut CameraFeed,
-        film: &mut FilmPart,
+        film: &mut BoundedFilm,
         outbox: &mut dyn Outbox,
         stop: &dyn Stop,
     ) -> Result<(), JobError> {
@@ -257,7 +257,7 @@ impl Loop {
     }
 
     /// Ends a path that leaves the scene.
-    pub fn miss(&mut self, context: &Context, ray: PathRay, film: &mut FilmPart) {
+    pub fn miss(&mut self, context: &Context, ray: PathRay, film: &mut BoundedFilm) {
         shade(context, &NoSurfaces, &[ray], &[Hit::miss(f32::INFINITY)], &mut self.outcome);
         self.collect(film);
     }
@@ -268,7 +268,7 @@ impl Loop {
         grid: &Grid,
         resident: &Resident,
         batch: &[ShadowFlight],
-        film: &mut FilmPart,
+        film: &mut BoundedFilm,
         outbox: &mut dyn Outbox,
     ) -> Result<(), JobError> {
         self.occluded.resize(batch.len(), false);
@@ -306,7 +306,7 @@ impl Loop {
         surfaces: &S,
         batch: &mut [PathFlight],
         out: &mut Flights,
-        film: &mut FilmPart,
+        film: &mut BoundedFilm,
     ) -> Result<(), JobError> {
         self.closest(resident, batch);
         let rays: Vec<PathRay> = batch.iter().map(|f| f.ray).collect();

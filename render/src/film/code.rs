@@ -6,6 +6,9 @@
 //! stored without the zero bytes at its low end and without the bytes of mere sign at its high end: the header's low nibble is the
 //! number of zero bytes below, its high nibble the number of bytes less 1. 0xff stands for a value of 0.
 
+use std::ops::Range;
+
+use super::bounded::add;
 use super::{FilmPart, KEPT_KEYS, Rejected, TILE, Tile};
 
 const MAGIC: &[u8; 4] = b"RHF1";
@@ -36,66 +39,101 @@ pub enum FilmError {
 impl FilmPart {
     /// The part as bytes, the same for the same sums.
     pub fn encode(&self) -> Vec<u8> {
+        self.encode_tiles(&(0..self.tiles.len()), &self.rejected)
+    }
+
+    /// The part that some of its tiles are.
+    pub(super) fn encode_tiles(&self, tiles: &Range<usize>, rejected: &Rejected) -> Vec<u8> {
         let mut out = Vec::new();
         out.extend(MAGIC);
         out.extend(self.size[0].to_le_bytes());
         out.extend(self.size[1].to_le_bytes());
-        out.extend(self.rejected.count.to_le_bytes());
-        out.push(self.rejected.keys.len() as u8);
-        for (pixel, sample) in &self.rejected.keys {
+        out.extend(rejected.count.to_le_bytes());
+        out.push(rejected.keys.len() as u8);
+        for (pixel, sample) in &rejected.keys {
             out.extend(pixel.to_le_bytes());
             out.extend(sample.to_le_bytes());
         }
-        out.extend((self.touched() as u32).to_le_bytes());
-        let mut body = Vec::new();
-        for (number, tile) in self.tiles.iter().enumerate() {
-            let Some(tile) = tile else { continue };
+        let touched = || tiles.clone().zip(&self.tiles[tiles.clone()]).filter_map(|(n, t)| Some((n, t.as_ref()?)));
+        out.extend((touched().count() as u32).to_le_bytes());
+        for (number, tile) in touched() {
             out.extend((number as u32).to_le_bytes());
-            let bitmap = out.len();
-            out.resize(bitmap + (TILE * TILE / 8) as usize, 0);
-            body.clear();
-            for (i, sums) in tile.0.iter().enumerate() {
-                if sums.as_flattened().iter().all(|&s| s == 0) {
-                    continue;
-                }
-                out[bitmap + i / 8] |= 1 << (i % 8);
-                for &sum in sums.as_flattened() {
-                    out.push(push_value(&mut body, sum));
-                }
-            }
-            out.extend(&body);
+            push_tile(&mut out, tile);
         }
         out
     }
 
     /// From bytes of a film of `size` pixels; reads no more memory than the film has tiles.
     pub fn decode(bytes: &[u8], size: [u32; 2]) -> Result<FilmPart, FilmError> {
+        let mut part = FilmPart::new(size);
+        let all = 0..part.tiles.len();
+        part.read(bytes, &all)?;
+        Ok(part)
+    }
+
+    /// Whether bytes are a part of a film of `size` pixels, found in no memory.
+    pub fn check(bytes: &[u8], size: [u32; 2]) -> Result<(), FilmError> {
+        FilmPart { size, tiles: Vec::new(), rejected: Rejected::default() }.read(bytes, &(0..0))
+    }
+
+    /// Adds some tiles of a part that is given as bytes, and what was rejected of their pixels. Nothing is added when the bytes are no
+    /// part of this film.
+    pub fn add_encoded(&mut self, bytes: &[u8], tiles: Range<u32>) -> Result<(), FilmError> {
+        FilmPart::check(bytes, self.size)?;
+        let tiles = tiles.start as usize..self.tiles.len().min(tiles.end as usize);
+        self.read(bytes, &tiles)
+    }
+
+    /// Adds the tiles of `take`; all others are looked at.
+    fn read(&mut self, bytes: &[u8], take: &Range<usize>) -> Result<(), FilmError> {
         let mut r = Reader { bytes, at: 0 };
         if r.take(4)? != MAGIC {
             return Err(FilmError::Magic);
         }
         let found = [r.u32()?, r.u32()?];
-        if found != size {
-            return Err(FilmError::Size { expected: size, found });
+        if found != self.size {
+            return Err(FilmError::Size { expected: self.size, found });
         }
-        let mut part = FilmPart::new(size);
-        part.rejected = r.rejected(size[0] as u64 * size[1] as u64)?;
-        let mut next = 0;
+        let rejected = r.rejected(u64::from(found[0]) * u64::from(found[1]))?;
+        let own = rejected.of(|pixel| take.contains(&self.place(pixel).0));
+        self.rejected.merge(&own);
+        let (mut next, tiles) = (0, found[0].div_ceil(TILE) as usize * found[1].div_ceil(TILE) as usize);
         for _ in 0..r.u32()? {
             let place = r.at;
             let number = r.u32()? as usize;
-            if number < next || number >= part.tiles.len() {
+            if number < next || number >= tiles {
                 return Err(FilmError::Corrupt(place));
             }
             next = number + 1;
-            let tile = r.tile()?;
-            part.tiles[number] = Some(tile);
+            if take.contains(&number) {
+                let tile = self.tiles[number].get_or_insert_with(Tile::new);
+                r.tile(|i, sum| add(tile, i, sum))?;
+            } else {
+                r.tile(|_, _| ())?;
+            }
         }
         if r.at != bytes.len() {
             return Err(FilmError::Corrupt(r.at));
         }
-        Ok(part)
+        Ok(())
     }
+}
+
+/// Appends a tile: bitmap, headers, values.
+pub(super) fn push_tile(out: &mut Vec<u8>, tile: &Tile) {
+    let bitmap = out.len();
+    out.resize(bitmap + (TILE * TILE / 8) as usize, 0);
+    let mut body = Vec::new();
+    for (i, sums) in tile.0.iter().enumerate() {
+        if sums.as_flattened().iter().all(|&s| s == 0) {
+            continue;
+        }
+        out[bitmap + i / 8] |= 1 << (i % 8);
+        for &sum in sums.as_flattened() {
+            out.push(push_value(&mut body, sum));
+        }
+    }
+    out.extend(&body);
 }
 
 /// Appends the bytes of a value that are not its sign's or zeros at the end, and returns the header.
@@ -111,9 +149,9 @@ fn push_value(body: &mut Vec<u8>, value: i128) -> u8 {
     low as u8 | (count as u8 - 1) << 4
 }
 
-struct Reader<'a> {
-    bytes: &'a [u8],
-    at: usize,
+pub(super) struct Reader<'a> {
+    pub bytes: &'a [u8],
+    pub at: usize,
 }
 
 impl<'a> Reader<'a> {
@@ -148,23 +186,20 @@ impl<'a> Reader<'a> {
         Ok(out)
     }
 
-    fn tile(&mut self) -> Result<Tile, FilmError> {
+    /// Hands over each sum of a tile's pixels that has one: its place, half by half, channel by channel, pixel after pixel, and itself.
+    pub fn tile(&mut self, mut each: impl FnMut(usize, i128)) -> Result<(), FilmError> {
         let bitmap = self.take((TILE * TILE / 8) as usize)?;
         let touched: usize = bitmap.iter().map(|b| b.count_ones() as usize).sum();
         let headers_at = self.at;
         let headers = self.take(6 * touched)?;
-        let mut tile = Tile::new();
         let mut next = 0;
-        for (i, sums) in tile.0.iter_mut().enumerate() {
-            if bitmap[i / 8] >> (i % 8) & 1 == 0 {
-                continue;
-            }
-            for sum in sums.as_flattened_mut() {
-                *sum = self.value(headers[next], headers_at + next)?;
+        for pixel in (0..(TILE * TILE) as usize).filter(|i| bitmap[i / 8] >> (i % 8) & 1 != 0) {
+            for i in 0..6 {
+                each(6 * pixel + i, self.value(headers[next], headers_at + next)?);
                 next += 1;
             }
         }
-        Ok(tile)
+        Ok(())
     }
 
     fn value(&mut self, header: u8, place: usize) -> Result<i128, FilmError> {

@@ -7,14 +7,18 @@
 //! A contribution that is not finite, is negative, or is 2^38 or more is not added: it is counted, and the smallest
 //! [`KEPT_KEYS`] of the (pixel, sample) that made one are kept to replay them. Sums stay exact below 2^63 per pixel and half.
 
+mod bounded;
 mod code;
 mod resolve;
 #[cfg(test)]
 mod tests;
 
 use std::collections::BTreeSet;
+use std::ops::Range;
 
+pub use bounded::BoundedFilm;
 pub use code::FilmError;
+pub use resolve::ErrorSum;
 
 /// Width and height of a tile in pixels.
 pub const TILE: u32 = 32;
@@ -55,6 +59,18 @@ pub struct Rejected {
 }
 
 impl Rejected {
+    /// What of it belongs to some of the pixels.
+    fn of(&self, belongs: impl Fn(u32) -> bool) -> Rejected {
+        let keys: BTreeSet<(u32, u32)> = self.keys.iter().copied().filter(|k| belongs(k.0)).collect();
+        let first = self.keys.first().map_or(0, |k| k.0);
+        let untold = if belongs(first) { self.count - self.keys.len() as u64 } else { 0 };
+        Rejected { count: keys.len() as u64 + untold, keys }
+    }
+    /// Adds what others rejected.
+    pub fn merge(&mut self, other: &Rejected) {
+        self.count += other.count;
+        other.keys.iter().for_each(|&key| self.insert(key));
+    }
     fn insert(&mut self, key: (u32, u32)) {
         self.keys.insert(key);
         if self.keys.len() > KEPT_KEYS {
@@ -117,6 +133,16 @@ impl FilmPart {
     /// are, its place is looked up once.
     #[inline]
     pub fn add_all(&mut self, light: impl Iterator<Item = (u32, u32, [f32; 3])>) {
+        self.add_with(light, |_, _| ());
+    }
+
+    /// The same; `before` is told of the tile that comes next, which it must leave as it is.
+    #[inline]
+    fn add_with(
+        &mut self,
+        light: impl Iterator<Item = (u32, u32, [f32; 3])>,
+        mut before: impl FnMut(&mut FilmPart, usize),
+    ) {
         let (mut last, mut tile, mut at) = (None, 0, 0);
         for (pixel, sample, value) in light {
             if !value.iter().all(|&x| (0.0..LIMIT).contains(&x)) {
@@ -126,6 +152,7 @@ impl FilmPart {
             if last != Some(pixel) {
                 last = Some(pixel);
                 (tile, at) = self.place(pixel);
+                before(self, tile);
             }
             let sums = &mut self.tiles[tile].get_or_insert_with(Tile::new).0[at];
             add(&mut sums[(sample & 1) as usize], value);
@@ -163,11 +190,14 @@ impl FilmPart {
                 *a = a.wrapping_add(*b);
             }
         }
-        self.rejected.count += other.rejected.count;
-        for &key in &other.rejected.keys {
-            self.rejected.insert(key);
-        }
+        self.rejected.merge(&other.rejected);
         Ok(())
+    }
+
+    /// What was rejected of the pixels of some tiles. What is not told by keys goes with the first key, so that the counts of all
+    /// tiles add up.
+    fn rejected_in(&self, tiles: &Range<usize>) -> Rejected {
+        self.rejected.of(|pixel| tiles.contains(&self.place(pixel).0))
     }
 
     fn sums(&self, x: u32, y: u32) -> &Sums {

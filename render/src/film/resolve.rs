@@ -1,6 +1,45 @@
 //! From sums to a picture and its error.
 
-use super::{FilmPart, Sums};
+use std::ops::AddAssign;
+
+use serde::{Deserialize, Serialize};
+
+use super::{FilmPart, Sums, TILE};
+
+/// 2^-64, in which sums of errors are counted as sums of light are.
+const UNIT: f64 = 1.0 / 18_446_744_073_709_551_616.0;
+
+/// Sum of Var / (M^2 + 0.01) over pixels and channels (see [`FilmPart::rel_mse`]), in units of 2^-64: what is below a unit in a tile is
+/// cut off, and the sums of parts of a film add up to that of the film, whatever the parts.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(from = "[u64; 2]", into = "[u64; 2]")]
+pub struct ErrorSum(u128);
+
+impl ErrorSum {
+    /// The mean over the channels of all pixels of a film.
+    pub fn mean(self, [width, height]: [u32; 2]) -> f64 {
+        self.0 as f64 * UNIT / (3.0 * f64::from(width) * f64::from(height))
+    }
+}
+
+impl AddAssign for ErrorSum {
+    fn add_assign(&mut self, other: ErrorSum) {
+        // an error is at most 2 (one half holds everything), and there are fewer than 2^34 channels
+        self.0 = self.0.wrapping_add(other.0);
+    }
+}
+
+impl From<[u64; 2]> for ErrorSum {
+    fn from([high, low]: [u64; 2]) -> Self {
+        ErrorSum(u128::from(high) << 64 | u128::from(low))
+    }
+}
+
+impl From<ErrorSum> for [u64; 2] {
+    fn from(sum: ErrorSum) -> Self {
+        [(sum.0 >> 64) as u64, sum.0 as u64]
+    }
+}
 
 impl FilmPart {
     /// The picture after `samples` samples per pixel (at least 1): sum / samples, exact, rounded once to the nearest float. Row by row, width *
@@ -21,15 +60,35 @@ impl FilmPart {
     /// (A - B)^2 n_A n_B / n^2, which is (A - B)^2 / 4 when both have the same number; of an odd number the even
     /// half has one more. `None` for fewer than two samples: one half is empty.
     pub fn rel_mse(&self, samples: u32) -> Option<f64> {
-        let mut sum = 0.0;
-        for y in 0..self.size[1] {
-            let mut row = 0.0;
-            for x in 0..self.size[0] {
-                row += pixel_error(self.sums(x, y), samples)?;
+        Some(self.error_sum(samples)?.mean(self.size))
+    }
+
+    /// What [`FilmPart::rel_mse`] is the mean of: tiles that were not touched have no error.
+    pub fn error_sum(&self, samples: u32) -> Option<ErrorSum> {
+        let mut sum = ErrorSum::default();
+        for tile in self.tiles.iter().flatten() {
+            let mut of_tile = 0.0;
+            for sums in tile.0.iter() {
+                of_tile += pixel_error(sums, samples)?;
             }
-            sum += row;
+            // below 2^13, and not negative
+            sum += ErrorSum((of_tile / UNIT) as u128);
         }
-        Some(sum / (3.0 * f64::from(self.size[0]) * f64::from(self.size[1])))
+        (samples >= 2).then_some(sum)
+    }
+
+    /// The picture's pixels in a tile, as [`FilmPart::resolve`] has them: column, row and value of each; none where nothing was touched.
+    pub fn resolve_tile(&self, number: u32, samples: u32, mut put: impl FnMut(u32, u32, [f32; 3])) {
+        let Some(tile) = &self.tiles[number as usize] else { return };
+        let [width, height] = self.size;
+        let across = width.div_ceil(TILE);
+        let (left, top) = (number % across * TILE, number / across * TILE);
+        for y in top..height.min(top + TILE) {
+            for x in left..width.min(left + TILE) {
+                let [a, b] = &tile.0[((y - top) * TILE + x - left) as usize];
+                put(x, y, std::array::from_fn(|c| quotient(a[c].wrapping_add(b[c]), samples)));
+            }
+        }
     }
 
     /// The same per pixel, mean over its channels, row by row.
@@ -52,7 +111,6 @@ fn pixel_error(sums: &Sums, samples: u32) -> Option<f64> {
     let n = f64::from(samples);
     let n_b = f64::from(samples / 2);
     let n_a = n - n_b;
-    const UNIT: f64 = 1.0 / 18_446_744_073_709_551_616.0; // 2^-64
     let [a, b] = sums;
     Some(
         (0..3)

@@ -233,3 +233,77 @@ fn error_estimate_is_the_error() {
     assert_eq!(FilmPart::new(size).rel_mse(1), None);
     assert_eq!(FilmPart::new(size).rel_mse(2), Some(0.0));
 }
+
+/// A film that holds few tiles is the film that holds all, by bands too, and holds no more than it may.
+#[test]
+fn a_bounded_film_is_the_whole_one_in_less_memory() {
+    let mut adds = random_adds(10, 20_000);
+    let bad = (0..40).map(|i| (i * 70, i, [f32::NAN; 3]));
+    adds.extend(bad);
+    let whole = filled(&adds);
+    assert_eq!((whole.tiles(), whole.touched()), (6, 6));
+    for most in [1, 2, 5, 6, 100] {
+        let mut bounded = BoundedFilm::new(SIZE, most);
+        for chunk in adds.chunks(97) {
+            bounded.add_all(chunk.iter().copied());
+            assert!(bounded.part.touched() <= most);
+        }
+        assert_eq!((bounded.touched(), bounded.packings() == 0), (6, most >= 6));
+        assert_eq!(bounded.clone().into_part(), whole);
+        for size in [1, 2, 4, 6, 1000] {
+            let (mut sum, mut error, mut bands) = (FilmPart::new(SIZE), ErrorSum::default(), Vec::new());
+            let mut resolved = vec![[0.0; 3]; (SIZE[0] * SIZE[1]) as usize];
+            let each = |band: u32, bytes: Vec<u8>| {
+                bands.push(band);
+                let part = FilmPart::decode(&bytes, SIZE)?;
+                let range = band * size..(band + 1) * size;
+                assert!(part.tiles.iter().enumerate().all(|(n, t)| t.is_none() || range.contains(&(n as u32))));
+                error += part.error_sum(16).unwrap();
+                for tile in 0..6 {
+                    part.resolve_tile(tile, 16, |x, y, value| resolved[(y * SIZE[0] + x) as usize] = value);
+                }
+                sum.add_encoded(&bytes, 0..6)
+            };
+            bounded.clone().into_bands(size, each).unwrap();
+            assert_eq!(sum, whole);
+            assert_eq!(bands, (0..6u32.div_ceil(size)).collect::<Vec<_>>());
+            assert_eq!((Some(error.mean(SIZE)), resolved), (whole.rel_mse(16), whole.resolve(16)));
+            let text = serde_json::to_string(&error).unwrap();
+            assert_eq!(serde_json::from_str::<ErrorSum>(&text).unwrap(), error);
+        }
+    }
+    let mut all = BoundedFilm::new(SIZE, 2);
+    all.add(3, 1, [1.0; 3]);
+    all.touch_all();
+    assert_eq!((all.touched(), all.part.touched()), (6, 2));
+    assert_eq!(all.into_part().touched(), 6);
+    // what takes a tenth of the tiles packs ten times; sparse tiles take few bytes
+    let wide = [32 * 400, 32];
+    let mut sparse = BoundedFilm::new(wide, 40);
+    (0..400).for_each(|tile| sparse.add(32 * tile + 5, 0, [0.5; 3]));
+    assert_eq!((sparse.touched(), sparse.packings()), (400, 9));
+    let full = 400 * (TILE * TILE) as usize * size_of::<Sums>();
+    assert!(sparse.memory() < full / 8, "{} of {full}", sparse.memory());
+}
+
+/// Some tiles of a part can be had without the others, and what is no part of the film changes nothing.
+#[test]
+fn tiles_are_read_alone() {
+    let mut adds = random_adds(11, 5000);
+    adds.extend((0..60).map(|i| (i * 50, 1, [-1.0; 3])));
+    let whole = filled(&adds);
+    let bytes = whole.encode();
+    assert_eq!(FilmPart::check(&bytes, SIZE), Ok(()));
+    let mut sum = FilmPart::new(SIZE);
+    for range in [4..6, 0..1, 1..4] {
+        sum.add_encoded(&bytes, range.clone()).unwrap();
+        assert!(range.into_iter().all(|t: u32| sum.tiles[t as usize] == whole.tiles[t as usize]));
+    }
+    assert_eq!(sum, whole);
+    let before = sum.clone();
+    for n in (0..bytes.len()).step_by(501) {
+        assert!(sum.add_encoded(&bytes[..n], 0..6).is_err());
+    }
+    assert!(sum.add_encoded(&FilmPart::new([1, 1]).encode(), 0..6).is_err());
+    assert_eq!(sum, before);
+}

@@ -79,9 +79,7 @@ pub struct Prepared {
 impl Prepared {
     /// Objects that were not made and stored again, as they were there: those that the manifest names.
     pub fn kept(&self) -> u64 {
-        let m = &self.manifest;
-        let all = 1 + u64::from(m.sky_map.is_some()) + m.tiles.len() as u64 + 2 * m.splits.len() as u64;
-        if self.reused { all } else { 0 }
+        if self.reused { self.manifest.objects().count() as u64 } else { 0 }
     }
 }
 

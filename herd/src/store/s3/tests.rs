@@ -187,6 +187,6 @@ async fn conforms_on_a_real_server() {
         let error = S3Store::connect(wrong).await.unwrap_err();
         assert!(matches!(&error, StoreError::Denied { .. }), "{error:?}");
         let error = S3Store::connect(S3Settings { bucket: "no-such-bucket".to_owned(), ..settings }).await.unwrap_err();
-        assert!(matches!(&error, StoreError::Misconfigured { .. }), "{error:?}");
+        assert!(matches!(&error, StoreError::NoBucket { .. }), "{error:?}");
     }
 }

@@ -1,0 +1,118 @@
+//! The film of a frame by bands of tiles: whoever adds it up, or makes a picture of it, holds one band at a time, however large it is.
+//!
+//! A band is so many tiles, row by row ([`Stage::band`](super::Stage)); tasks store a part of the film for each band that they touched.
+//! A film of one band is stored as a whole. Parts that name no band (of earlier versions) may have something of any.
+
+use std::collections::BTreeSet;
+use std::io::{Seek, Write};
+use std::ops::Range;
+
+use rayherd_render::film::{ErrorSum, FilmPart, KEPT_KEYS, TILE};
+use serde_json::{Map, Value};
+
+use crate::job::JobError;
+use crate::ledger::FilmRef;
+use crate::picture;
+
+/// Tiles of a band: 48 MiB of sums.
+pub const BAND: u32 = 512;
+
+/// How many bands a film of `size` pixels has, each of so many tiles.
+pub fn count([width, height]: [u32; 2], band: u32) -> u32 {
+    (width.div_ceil(TILE) * height.div_ceil(TILE)).div_ceil(band.max(1))
+}
+
+/// Adds up the film of a frame.
+pub struct Adder<'a> {
+    /// Width and height in pixels.
+    pub size: [u32; 2],
+    /// Tiles of a band.
+    pub band: u32,
+    /// Reads a part: encoded and checked.
+    pub read: &'a dyn Fn(&FilmRef) -> Result<Vec<u8>, JobError>,
+}
+
+/// What is known of a film when all of it was looked at.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Totals {
+    /// Sum of the errors; none for one sample per pixel.
+    pub error: Option<ErrorSum>,
+    /// Pixel and sample of the first contributions that were not finite.
+    pub non_finite: BTreeSet<(u32, u32)>,
+}
+
+impl Totals {
+    /// Adds those of another part of the film.
+    pub fn add(&mut self, error: Option<ErrorSum>, non_finite: impl IntoIterator<Item = (u32, u32)>) {
+        if let Some(error) = error {
+            *self.error.get_or_insert_default() += error;
+        }
+        self.non_finite.extend(non_finite);
+        while self.non_finite.len() > KEPT_KEYS {
+            self.non_finite.pop_last();
+        }
+    }
+}
+
+impl Adder<'_> {
+    fn tiles(&self, band: u32) -> Range<u32> {
+        let first = band.saturating_mul(self.band);
+        first..first.saturating_add(self.band)
+    }
+
+    /// The sum of a band, or of the whole film.
+    ///
+    /// # Errors
+    /// When a part cannot be read.
+    pub fn sum(&self, parts: &[FilmRef], band: Option<u32>) -> Result<FilmPart, JobError> {
+        let mut sum = FilmPart::new(self.size);
+        let tiles = band.map_or(0..u32::MAX, |b| self.tiles(b));
+        for part in parts.iter().filter(|p| band.is_none() || p.band.is_none() || p.band == band) {
+            sum.add_encoded(&(self.read)(part)?, tiles.clone())?;
+        }
+        Ok(sum)
+    }
+
+    /// Writes the picture of `samples` samples per pixel, from the top down.
+    ///
+    /// # Errors
+    /// When a part cannot be read, or the picture cannot be written.
+    pub fn picture(
+        &self,
+        parts: &[FilmRef],
+        samples: u32,
+        definition: &Map<String, Value>,
+        out: impl Write + Seek,
+    ) -> Result<Totals, JobError> {
+        let [width, height] = self.size;
+        let across = width.div_ceil(TILE);
+        let (mut totals, mut current): (Totals, Option<(u32, FilmPart)>) = Default::default();
+        // rows of the tiles that are being written
+        let mut rows = vec![[0.0; 3]; width as usize * TILE as usize];
+        let next = |y: u32, row: &mut [[f32; 3]]| -> Result<(), JobError> {
+            if y.is_multiple_of(TILE) {
+                rows.fill([0.0; 3]);
+                for tile in (y / TILE * across)..(y / TILE + 1) * across {
+                    let band = tile / self.band.max(1);
+                    if current.as_ref().is_none_or(|c| c.0 != band) {
+                        // the one before goes first
+                        current = None;
+                        let sum = self.sum(parts, Some(band))?;
+                        totals.add(sum.error_sum(samples), sum.rejected().keys.iter().copied());
+                        current = Some((band, sum));
+                    }
+                    if let Some((_, sum)) = &current {
+                        sum.resolve_tile(tile, samples, |x, y, value| {
+                            rows[(y % TILE * width + x) as usize] = value;
+                        });
+                    }
+                }
+            }
+            let from = (y % TILE * width) as usize;
+            row.copy_from_slice(&rows[from..from + width as usize]);
+            Ok(())
+        };
+        picture::write([width, height], definition, next, out)?;
+        Ok(totals)
+    }
+}
