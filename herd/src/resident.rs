@@ -131,7 +131,8 @@ impl Resident {
             }
         }
         let attributes = self.attributes.get().ok_or_else(|| JobError::Internal("attributes vanished".into()))?;
-        Ok(ResidentSurfaces { resident: self, attributes })
+        let is_far = attributes.iter().map(Attributes::bytes).sum::<usize>() > NEAR_BYTES;
+        Ok(ResidentSurfaces { resident: self, attributes, is_far })
     }
 
     #[inline(always)]
@@ -174,7 +175,6 @@ impl Attributes {
         Attributes { block, starts: Some(starts), shapes }
     }
 
-    #[cfg(test)]
     fn bytes(&self) -> usize {
         let AttributeBlock { shapes, normals, uvs, attributes } = &self.block;
         let starts = self.starts.as_ref().map_or(0, Vec::capacity);
@@ -197,10 +197,14 @@ impl Attributes {
     }
 }
 
+/// Attributes of so many bytes stay in a core's own caches.
+const NEAR_BYTES: usize = 256 << 10;
+
 /// Surfaces of resident splits.
 pub struct ResidentSurfaces<'a> {
     resident: &'a Resident,
     attributes: &'a [Attributes],
+    is_far: bool,
 }
 
 impl ResidentSurfaces<'_> {
@@ -236,6 +240,9 @@ impl Surfaces for ResidentSurfaces<'_> {
             Primitive::Triangle(vertices) if attributes.normals(local).is_none() => Some(vertices),
             _ => None,
         }
+    }
+    fn is_far(&self) -> bool {
+        self.is_far
     }
     #[inline(always)]
     fn foresee(&self, hit: &Hit) {

@@ -136,7 +136,11 @@ pub trait Surfaces {
             _ => None,
         }
     }
-    /// Asks for what [`Surfaces::surface`] of a hit will read, if that may be far.
+    /// Whether surfaces lie in memory that is far: then [`Surfaces::foresee`] pays.
+    fn is_far(&self) -> bool {
+        false
+    }
+    /// Asks for what [`Surfaces::surface`] of a hit will read.
     fn foresee(&self, _: &Hit) {}
     /// The global id of what ray `index` hit: asked for where light is met only.
     fn prim(&self, index: usize, hit: &Hit) -> PrimId;

@@ -43,9 +43,9 @@ pub fn shade_traced<S: Surfaces>(
     out.counters.shaded += rays.len() as u64;
     let looks_up = looks_up(context);
     let bares = context.skips.makes(Skip::Details);
-    let has_textures = !context.world.textures.is_empty();
+    let (is_far, has_textures) = (surfaces.is_far(), !context.world.textures.is_empty());
     for (index, ((ray, traced), hit)) in rays.iter().zip(traced).zip(hits).enumerate() {
-        if let Some(hit) = hits.get(index + SURFACES_AHEAD).filter(|hit| hit.is_hit()) {
+        if is_far && let Some(hit) = hits.get(index + SURFACES_AHEAD).filter(|hit| hit.is_hit()) {
             surfaces.foresee(hit);
         }
         if has_textures && let (Some(ray), Some(hit)) = (rays.get(index + TEXELS_AHEAD), hits.get(index + TEXELS_AHEAD))
