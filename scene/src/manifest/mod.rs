@@ -18,7 +18,7 @@ use crate::prepare::PrepareSettings;
 
 /// Version of the manifest and of everything it names. A change of any layout, of recentring, of the order of records
 /// or of the grid's rules changes it; scenes of other versions are prepared again.
-pub const FORMAT: u32 = 4;
+pub const FORMAT: u32 = 5;
 
 /// A prepared scene. Its bytes are canonical ([`Manifest::encode`]); its name is their hash.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
