@@ -21,6 +21,8 @@ const MOST_TEXT: usize = 2000;
 
 const TRIANGLE: &str = "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n";
 const LIT: &str = "<emitter type='constant'/>";
+/// A picture of one texel.
+const HDR: &[u8] = b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 1 +X 1\n\x80\x40\x20\x81";
 
 /// A folder with the inputs of one table.
 struct Bed(tempfile::TempDir);
@@ -367,6 +369,44 @@ fn what_lies_outside_or_is_no_file() {
         .write("in/up.nhdr", nhdr("../secret.raw"))
         .pipe("in/pipe.raw")
         .write("in/pipe.nhdr", nhdr("pipe.raw"));
+    // a mesh's materials and maps
+    bed.write("secret.mtl", "hunter2 is the password\n").write("secret.hdr", HDR);
+    symlink("../secret.mtl", bed.path().join("in/link.mtl")).unwrap();
+    symlink("../secret.hdr", bed.path().join("in/link.hdr")).unwrap();
+    let [mtl, hdr] = ["secret.mtl", "secret.hdr"].map(|name| bed.path().join(name));
+    let library = |name: &str, file: &str| {
+        bed.write(&format!("in/{name}.obj"), format!("# a mesh\nmtllib {file}\n{TRIANGLE}"));
+    };
+    let map = |name: &str, file: &str| {
+        bed.write(&format!("in/{name}.mtl"), format!("newmtl m\nmap_Kd {file}\n"));
+        library(name, &format!("{name}.mtl"));
+    };
+    library("library-up", "../secret.mtl");
+    library("library-absolute", mtl.to_str().unwrap());
+    library("library-link", "link.mtl");
+    library("library-back", "..\\secret.mtl");
+    library("library-two", "none.mtl ../secret.mtl");
+    map("map-up", "../secret.hdr");
+    map("map-absolute", hdr.to_str().unwrap());
+    map("map-link", "-clamp on link.hdr");
+    // what lies inside may be named through a folder, by a link, and from a library in a folder
+    bed.write("in/maps/m.hdr", HDR).write("in/parts/m.mtl", "newmtl m\nmap_Kd ../maps/link.hdr\n");
+    symlink("m.hdr", bed.path().join("in/maps/link.hdr")).unwrap();
+    library("inside", "parts/m.mtl");
+    assert_eq!(bed.line("check in/inside.obj").code, 0);
+    for line in ["library-up", "library-absolute", "library-link", "library-back", "library-two"] {
+        for more in ["", " --substitute"] {
+            let line = format!("check in/{line}.obj{more}");
+            let run = bed.line(&line);
+            assert_error(&line, &run, 2, &[".obj:2", "outside the scene's folder", "copy it there"]);
+            assert!(!run.err.contains("hunter2"), "{}", run.err);
+        }
+    }
+    // links among the meshes of a folder
+    bed.write("linked/a.obj", TRIANGLE);
+    symlink("a.obj", bed.path().join("linked/b.obj")).unwrap();
+    assert_eq!(bed.line("check linked").code, 0);
+    symlink("../secret.obj", bed.path().join("linked/c.obj")).unwrap();
     let outside = &["outside the scene's folder", "copy it there"][..];
     bed.mistakes(&[
         ("render in/up.xml", &[&["in/up.xml:3"], outside].concat()),
@@ -379,6 +419,10 @@ fn what_lies_outside_or_is_no_file() {
         ("render in/piped.xml", &["pipe.xml", "not a regular file"]),
         ("render in/piped-mesh.xml", &["pipe.obj", "not a regular file"]),
         ("render in/up.nhdr --iso 1", &["up.nhdr:6", "outside"]),
+        ("render in/map-up.obj", &[&["in/map-up.mtl:2"], outside].concat()),
+        ("render in/map-absolute.obj", &[&["in/map-absolute.mtl:2"], outside].concat()),
+        ("render in/map-link.obj", &[&["in/map-link.mtl:2"], outside].concat()),
+        ("render linked", &[&["linked/c.obj"], outside].concat()),
         ("render in/pipe.nhdr --iso 1", &["pipe.raw", "not a file"]),
         ("render in/pipe.xml", &["pipe.xml", "not a regular file"]),
         ("check in/pipe.obj", &["pipe.obj", "not a regular file"]),
@@ -446,6 +490,13 @@ fn dicom_folders() {
     }
     let whole = dicom("1.2.3", 1);
     bed.write("cut/1.dcm", &whole[..whole.len() - 3]).write("none/readme.txt", "nothing here");
+    // an image by a link that leads out of its folder: not read with the folder, but where it is named itself
+    bed.write("linked/0.dcm", dicom("1.2.3", 0));
+    symlink("../good/1.dcm", bed.path().join("linked/1.dcm")).unwrap();
+    bed.write("within/real/1.dcm", &whole).write("within/0.dcm", dicom("1.2.3", 0));
+    symlink("real/1.dcm", bed.path().join("within/1.dcm")).unwrap();
+    assert_eq!(bed.line("render within --iso 1 --spp 1 --size 4x4").code, 0);
+    assert_eq!(bed.line("render linked/1.dcm --iso 1 --spp 1 --size 4x4").code, 0);
     assert_eq!(bed.line("render good --iso 1 --spp 1 --size 4x4").code, 0);
     assert_eq!(bed.line("render mixed/b1.dcm --iso 1 --spp 1 --size 4x4").code, 0);
     bed.mistakes(&[
@@ -453,6 +504,8 @@ fn dicom_folders() {
         ("render gap --iso 1", &["gap/4.dcm", "gap/2.dcm", "an image is missing, or the spacing is uneven"]),
         ("render cut --iso 1", &["cut/1.dcm"]),
         ("render none --iso 1", &["none", "no DICOM image"]),
+        ("render linked --iso 1", &["linked/1.dcm", "outside the scene's folder", "copy it there"]),
+        ("render linked/0.dcm --iso 1", &["linked/1.dcm", "outside the scene's folder", "copy it there"]),
         ("render good", &["good", "--iso"]),
         ("render good --iso 99999", &["good", "both sides of the iso value"]),
     ]);

@@ -7,7 +7,7 @@ use super::framing::{self, Up};
 use super::isosurface::IsoSurfaceSource;
 use super::mesh::extension;
 use super::mtl::Libraries;
-use super::{DEFAULT_ALBEDO, ImportOptions, refuse};
+use super::{DEFAULT_ALBEDO, ImportOptions, inside, refuse};
 use crate::ImportError;
 use crate::description::{
     Affine, Bsdf, Description, Detail, Environment, Geometry, Material, MeshFormat, Place, Shape, Slot, Texture,
@@ -33,6 +33,7 @@ pub(super) fn meshes_in(folder: &Path) -> Result<Vec<(PathBuf, MeshFormat)>, Imp
         if let Some(format) = mesh_format(&path)
             && path.is_file()
         {
+            inside::check_entry(&path, folder)?;
             found.push((path, format));
         }
     }
@@ -61,7 +62,8 @@ pub(super) fn meshes(
             MeshFormat::Obj if looks => {
                 let (names, bytes) = super::obj::libraries(path)?;
                 out.bytes_read += bytes;
-                let mut libraries = Libraries { options, out: &mut out, unsupported: vec![] };
+                let folder = inside::folder_of(path)?;
+                let mut libraries = Libraries { options, out: &mut out, unsupported: vec![], folder };
                 let found = libraries.read(path, &names)?;
                 (parts, made) = (Some(found.0), found.1);
                 unsupported.append(&mut libraries.unsupported);

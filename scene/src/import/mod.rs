@@ -3,6 +3,7 @@
 mod bare;
 mod bounds;
 mod framing;
+mod inside;
 pub mod isosurface;
 mod mesh;
 mod metals;

@@ -10,7 +10,7 @@ use std::path::{Path, PathBuf};
 use super::{transform, value};
 use crate::ImportError;
 use crate::description::{Affine, Place};
-use crate::import::regular;
+use crate::import::{inside, regular};
 
 /// Most bytes of XML read for one scene, includes among them.
 const MAX_BYTES: u64 = 64 << 20;
@@ -95,7 +95,7 @@ impl Document {
     pub fn read(path: &Path, defines: &[(String, String)]) -> Result<Document, ImportError> {
         let io = |source| ImportError::Io { path: path.into(), source };
         let canonical = path.canonicalize().map_err(io)?;
-        let folder = canonical.parent().map(Path::to_path_buf).unwrap_or_default();
+        let folder = inside::folder_of(path)?;
         let mut parameters = Parameters::new(defines);
         let mut reader = Reader {
             document: Document {
@@ -151,15 +151,7 @@ impl Document {
         let Ok(canonical) = path.canonicalize() else {
             return malformed(place, format!("file \"{name}\" does not exist beside the scene"));
         };
-        if !canonical.starts_with(&self.folder) {
-            let folder = self.folder.display();
-            return malformed(
-                place,
-                format!(
-                    "file \"{name}\" lies outside the scene's folder {folder}; only files inside are read: copy it there"
-                ),
-            );
-        }
+        inside::check(&canonical, &self.folder, name, place)?;
         Ok(canonical)
     }
 }

@@ -9,7 +9,7 @@
 //! `d` is what it is in the source, "the amount this material dissolves into the background": opacity.
 
 use super::statement::{Map, Statement};
-use super::{Entry, Libraries, Part, file_in};
+use super::{Entry, Libraries, Part};
 use crate::ImportError;
 use crate::description::{
     Amount, Bsdf, Detail, Distribution, Material, Principled, Relief, ReliefKind, Slot, TexelFilter, Texture,
@@ -264,7 +264,7 @@ impl Libraries<'_> {
             self.unsupported(&s.place, format!("{option} of {}", s.keyword), "the texture without it");
         }
         let folder = s.place.file.parent().unwrap_or(std::path::Path::new(""));
-        let path = file_in(folder, &file);
+        let path = self.file_in(folder, &file, &s.place)?;
         let header = if path.is_file() { image::header(&path, raw) } else { Err("is not there".into()) };
         let header = match header {
             Ok(header) => header,

@@ -11,9 +11,9 @@ mod tests;
 
 use std::path::{Path, PathBuf};
 
-use super::ImportOptions;
 use super::obj::LibraryNames;
 use super::source::Source;
+use super::{ImportOptions, inside};
 use crate::ImportError;
 use crate::description::{Description, Material, Note, Parts, Place};
 use statement::Statement;
@@ -46,6 +46,8 @@ pub(super) struct Libraries<'a> {
     pub out: &'a mut Description,
     /// What is not supported, while stand-ins are not allowed.
     pub unsupported: Vec<(Place, String)>,
+    /// The canonical folder of the OBJ file ([`inside::folder_of`]): no file outside is read.
+    pub folder: PathBuf,
 }
 
 impl Libraries<'_> {
@@ -58,7 +60,7 @@ impl Libraries<'_> {
         for (name, line) in names {
             parts.libraries.push(name.clone());
             let place = Place { file: obj.into(), line: *line };
-            for path in self.paths(folder, name, &place) {
+            for path in self.paths(folder, name, &place)? {
                 for entry in entries(&path, &mut self.out.bytes_read)? {
                     if !seen.insert(entry.name.clone()) {
                         self.note(&entry.place, format!("a second material \"{}\": the first one is used", entry.name));
@@ -73,14 +75,14 @@ impl Libraries<'_> {
     }
 
     /// The files that a `mtllib` statement names: one, or several with blanks in between.
-    fn paths(&mut self, folder: &Path, name: &str, place: &Place) -> Vec<PathBuf> {
-        let whole = file_in(folder, name);
+    fn paths(&mut self, folder: &Path, name: &str, place: &Place) -> Result<Vec<PathBuf>, ImportError> {
+        let whole = self.file_in(folder, name, place)?;
         if whole.is_file() {
-            return vec![whole];
+            return Ok(vec![whole]);
         }
         let mut out = vec![];
         for word in name.split_ascii_whitespace() {
-            let path = file_in(folder, word);
+            let path = self.file_in(folder, word, place)?;
             if path.is_file() {
                 out.push(path);
             } else {
@@ -88,7 +90,18 @@ impl Libraries<'_> {
                 self.unsupported(place, what, "one grey material");
             }
         }
-        out
+        Ok(out)
+    }
+
+    /// A file that a statement names, from the folder of the one that it stands in. Backslashes are how some systems separate folders.
+    ///
+    /// # Errors
+    /// It lies outside the scene's folder.
+    fn file_in(&self, folder: &Path, name: &str, place: &Place) -> Result<PathBuf, ImportError> {
+        let path = folder.join(name);
+        let path = if path.exists() { path } else { folder.join(name.replace('\\', "/")) };
+        inside::check(&path, &self.folder, name, place)?;
+        Ok(path)
     }
 
     /// Notes something unsupported, or its stand-in when stand-ins are allowed.
@@ -104,12 +117,6 @@ impl Libraries<'_> {
         }
         self.out.notes.push(Note { place: place.clone(), text });
     }
-}
-
-/// A file that a statement names, from the folder of the one that it stands in. Backslashes are how some systems separate folders.
-fn file_in(folder: &Path, name: &str) -> PathBuf {
-    let path = folder.join(name);
-    if path.exists() { path } else { folder.join(name.replace('\\', "/")) }
 }
 
 /// The materials of a library, in its order.

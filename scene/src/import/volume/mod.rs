@@ -87,6 +87,7 @@ pub fn is_volume(path: &Path) -> Result<bool, ImportError> {
         let io = |source| ImportError::Io { path: path.to_owned(), source };
         for entry in std::fs::read_dir(path).map_err(io)? {
             let file = entry.map_err(io)?.path();
+            super::inside::check_entry(&file, path)?;
             if file.is_file() && matches!(format(&file, &Bytes::default())?, Some(Format::Dicom)) {
                 return Ok(true);
             }

@@ -3,6 +3,7 @@
 mod element;
 
 use std::collections::{BTreeMap, BTreeSet};
+use std::ffi::OsStr;
 use std::io::{BufReader, Read};
 use std::path::{Path, PathBuf};
 
@@ -12,6 +13,7 @@ use super::layout::{Layout, Part, Skip, check_dims};
 use super::slices::{Bytes, Counted};
 use super::{SampleType, Volume, malformed};
 use crate::ImportError;
+use crate::import::inside;
 
 const SERIES_DESCRIPTION: Tag = (0x0008, 0x103e);
 const SERIES: Tag = (0x0020, 0x000e);
@@ -95,7 +97,7 @@ pub(super) fn is_dicom(first: &[u8]) -> bool {
 
 /// Opens the series in a folder, which must be the only one there.
 pub(super) fn open_folder(folder: &Path, bytes: &Bytes) -> Result<(Volume, Layout), ImportError> {
-    let scan = scan(folder, bytes)?;
+    let scan = scan(folder, None, bytes)?;
     let mut series: BTreeMap<&str, Vec<&Found>> = BTreeMap::new();
     for image in &scan.images {
         series.entry(&image.series).or_default().push(image);
@@ -135,7 +137,7 @@ pub(super) fn open_file(path: &Path, bytes: &Bytes) -> Result<(Volume, Layout), 
         return Err(malformed(path, 0, "this DICOM file holds no image"));
     };
     let folder = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
-    let mut scan = scan(folder, bytes)?;
+    let mut scan = scan(folder, path.file_name(), bytes)?;
     scan.images.retain(|i| i.series == image.series);
     assemble(folder, scan)
 }
@@ -146,7 +148,8 @@ struct Scan {
     folders: usize,
 }
 
-fn scan(folder: &Path, bytes: &Bytes) -> Result<Scan, ImportError> {
+/// Reads the headers of a folder's files. Of links only that of this name, which the user gave, may lead out of it.
+fn scan(folder: &Path, named: Option<&OsStr>, bytes: &Bytes) -> Result<Scan, ImportError> {
     let io = |source| ImportError::Io { path: folder.to_owned(), source };
     let mut names = Vec::new();
     let mut folders = 0;
@@ -162,6 +165,9 @@ fn scan(folder: &Path, bytes: &Bytes) -> Result<Scan, ImportError> {
     let mut images = Vec::new();
     let mut others = Vec::new();
     for path in names {
+        if path.file_name() != named {
+            inside::check_entry(&path, folder)?;
+        }
         match read(&path, bytes)? {
             Some(image) => images.push(image),
             None => others.push(path),
