@@ -10,6 +10,7 @@ use rayherd_herd::ledger::FilmRef;
 use rayherd_herd::picture;
 use rayherd_herd::remote::bands::{Adder, BAND, count};
 use rayherd_render::film::BoundedFilm;
+use rayherd_tests::mutation::peak_memory;
 use serde_json::{Map, Value};
 
 /// Tells the child where to work.
@@ -41,13 +42,6 @@ fn definition() -> Map<String, Value> {
     Map::from_iter([("spp".to_owned(), Value::from(2))])
 }
 
-/// Peak of this process, bytes.
-fn peak() -> Option<u64> {
-    let text = fs::read_to_string("/proc/self/status").ok()?;
-    let line = text.lines().find_map(|l| l.strip_prefix("VmHWM:"))?;
-    Some(line.trim().strip_suffix(" kB")?.trim().parse::<u64>().ok()? << 10)
-}
-
 /// The child.
 #[test]
 fn child() {
@@ -73,7 +67,7 @@ fn child() {
     let out = BufWriter::new(File::create(folder.join("picture.exr")).unwrap());
     let totals = adder.picture(&parts, 2, &definition(), out).unwrap();
     assert!(totals.error.is_some_and(|e| e.mean(SIZE) > 0.0));
-    println!("peak {}", peak().unwrap_or(0));
+    println!("peak {}", peak_memory().map_or(0, |kib| kib << 10));
 }
 
 #[test]

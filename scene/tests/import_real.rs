@@ -1,26 +1,18 @@
 //! Real scenes made by others (`../shared/data`, not part of the repository): how many triangles they have. Where a scene is
 //! absent the test says so and passes.
 
-use std::path::{Path, PathBuf};
-use std::process::Command;
+use std::path::PathBuf;
 
 use rayherd_scene::description::Description;
 use rayherd_scene::import::isosurface::IsoSurfaceSource;
 use rayherd_scene::import::{DescriptionSource, ImportOptions, StreamOptions, import, import_surface};
 use rayherd_scene::record::{Record, RecordSource};
+use rayherd_tests::shared;
 
 /// Unpacks a set into a folder that vanishes; none if it is not there.
 fn unpack(name: &str) -> Option<(tempfile::TempDir, PathBuf)> {
-    let archive =
-        Path::new(env!("CARGO_MANIFEST_DIR")).join("../../shared/data").join(name).join(format!("{name}.tar.xz"));
-    if !archive.exists() {
-        println!("{} is absent: not tested", archive.display());
-        return None;
-    }
     let dir = tempfile::tempdir().unwrap();
-    let status = Command::new("tar").arg("xf").arg(&archive).arg("-C").arg(dir.path()).status().unwrap();
-    assert!(status.success(), "tar cannot unpack {}", archive.display());
-    let folder = dir.path().join(name);
+    let folder = shared::unpack(name, dir.path())?;
     Some((dir, folder))
 }
 

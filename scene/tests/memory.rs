@@ -8,9 +8,15 @@ use std::process::Command;
 use rayherd_scene::import::{DescriptionSource, ImportOptions, StreamOptions, import};
 use rayherd_scene::objects::DirectoryObjects;
 use rayherd_scene::prepare::{Cut, NoProgress, PrepareSettings, SpoolSettings, prepare};
+use rayherd_tests::mutation::peak_memory;
+use rayherd_tests::shared;
 
 /// Tells the child what to prepare.
 const JOB: &str = "RAYHERD_MEMORY_JOB";
+/// Tells it of a scan to prepare instead.
+const SCAN: &str = "RAYHERD_MEMORY_SCAN";
+/// Value of the scan's surface.
+const CHEST: f64 = -789.5;
 /// Samples along x and y.
 const SIDE: usize = 96;
 const BLOCK: u64 = 2 << 20;
@@ -42,37 +48,46 @@ fn gyroid(path: &Path, depth: usize) {
     out.flush().unwrap();
 }
 
-/// Peak of this process, bytes.
-fn peak() -> Option<u64> {
-    let text = std::fs::read_to_string("/proc/self/status").ok()?;
-    let line = text.lines().find_map(|l| l.strip_prefix("VmHWM:"))?;
-    Some(line.trim().strip_suffix(" kB")?.trim().parse::<u64>().ok()? << 10)
-}
-
-/// The child: `FOLDER` holds the volume, and what is prepared goes there.
+/// The child: the folder in `JOB` holds the volume, and what is prepared goes there.
 #[test]
 fn child() {
     let Ok(folder) = std::env::var(JOB) else { return };
     let folder = Path::new(&folder);
     let threads = rayon::ThreadPoolBuilder::new().num_threads(THREADS as usize).build().unwrap();
-    let options = ImportOptions { iso: Some(0.25), ..ImportOptions::default() };
-    let description = import(&folder.join("v.nrrd"), &options).unwrap();
+    let spool = SpoolSettings { folder: Some(folder.into()), ..SpoolSettings::default() };
+    let (volume, iso, cut, spool) = match std::env::var_os(SCAN) {
+        Some(scan) => (scan.into(), CHEST, Cut::Splits(32), spool),
+        None => (folder.join("v.nrrd"), 0.25, Cut::BlockSize(BLOCK), SpoolSettings { memory: 4 * MIB, ..spool }),
+    };
+    let options = ImportOptions { iso: Some(iso), ..ImportOptions::default() };
+    let description = import(&volume, &options).unwrap();
     let source = DescriptionSource::new(&description, StreamOptions::default());
-    let settings = PrepareSettings { cut: Cut::BlockSize(BLOCK), ..PrepareSettings::default() };
-    let spool = SpoolSettings { memory: 4 * MIB, folder: Some(folder.into()), ..SpoolSettings::default() };
+    let settings = PrepareSettings { cut, ..PrepareSettings::default() };
     let store = DirectoryObjects::open(folder.join("store")).unwrap();
     let prepared = threads.install(|| prepare(&description, &source, &settings, &spool, &store, &NoProgress)).unwrap();
     let manifest = &prepared.manifest;
-    let Some(peak) = peak() else { return println!("no VmHWM") };
-    println!("told {peak} {} {} {}", manifest.counts.triangles, manifest.splits.len(), manifest.grid.cells.len());
+    let Some(kib) = peak_memory() else { return println!("no VmHWM") };
+    println!(
+        "told {} {} {} {}",
+        kib << 10,
+        manifest.counts.triangles,
+        manifest.splits.len(),
+        manifest.grid.cells.len()
+    );
 }
 
 /// Peak, triangles, splits and cells of preparing a gyroid of so many slices; none where the system does not tell.
 fn measure(depth: usize) -> Option<[u64; 4]> {
     let folder = tempfile::tempdir().unwrap();
     gyroid(&folder.path().join("v.nrrd"), depth);
-    let test = std::env::current_exe().unwrap();
-    let child = Command::new(test).args(["child", "--exact", "--nocapture"]).env(JOB, folder.path()).output().unwrap();
+    told(folder.path(), None, &format!("{depth} slices"))
+}
+
+/// What a child tells that prepares the volume of a folder, or a scan there.
+fn told(folder: &Path, scan: Option<&Path>, what: &str) -> Option<[u64; 4]> {
+    let mut child = Command::new(std::env::current_exe().unwrap());
+    child.args(["child", "--exact", "--nocapture"]).env(JOB, folder).env_remove(SCAN);
+    let child = child.envs(scan.map(|scan| (SCAN, scan))).output().unwrap();
     let text = String::from_utf8_lossy(&child.stdout);
     assert!(child.status.success(), "{text}\n{}", String::from_utf8_lossy(&child.stderr));
     let told = text.lines().find_map(|l| l.split("told ").nth(1));
@@ -81,7 +96,7 @@ fn measure(depth: usize) -> Option<[u64; 4]> {
         return None;
     };
     let numbers: Vec<u64> = told.split(' ').map(|n| n.parse().unwrap()).collect();
-    println!("{depth} slices: peak {:.1} MiB, {told}", numbers[0] as f64 / MIB as f64);
+    println!("{what}: peak {:.1} MiB, {told}", numbers[0] as f64 / MIB as f64);
     Some(numbers.try_into().unwrap())
 }
 
@@ -99,4 +114,16 @@ fn memory_is_by_splits_and_grid() {
     }
     let more = large[0].saturating_sub(small[0]);
     assert!(more < 16 * MIB, "eight times the scene takes {more} bytes more");
+}
+
+/// A scan of 144 MB, 8.1 million triangles, 32 splits.
+#[test]
+fn the_chest_scan_takes_less_than_300_mib() {
+    let folder = tempfile::tempdir().unwrap();
+    let Some(scan) = shared::unpack("ct-lidc-0314", folder.path()) else { return };
+    let Some([peak, triangles, splits, _]) = told(folder.path(), Some(&scan.join("dicom")), "the chest scan") else {
+        return;
+    };
+    assert!(triangles > 8_000_000 && splits >= 32, "{triangles} triangles, {splits} splits");
+    assert!(peak < 300 * MIB, "{:.1} MiB at the peak", peak as f64 / MIB as f64);
 }

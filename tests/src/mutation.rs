@@ -213,6 +213,11 @@ fn word(bytes: &[u8], at: usize) -> Range<usize> {
 
 /// Most memory that this process held so far, KiB, where the system tells.
 pub fn peak_memory() -> Option<u64> {
-    let status = std::fs::read_to_string("/proc/self/status").ok()?;
+    peak_memory_of("self")
+}
+
+/// The same of a process that runs, by its number.
+pub fn peak_memory_of(process: impl std::fmt::Display) -> Option<u64> {
+    let status = std::fs::read_to_string(format!("/proc/{process}/status")).ok()?;
     status.lines().find_map(|l| l.strip_prefix("VmHWM:"))?.trim().trim_end_matches("kB").trim().parse().ok()
 }
