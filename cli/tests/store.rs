@@ -3,11 +3,13 @@
 mod common;
 
 use std::fs;
+use std::io::Read;
 use std::path::Path;
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
 use common::{Run, assert_mistake, rayherd, repository};
+use rayherd_herd::wire::envelope::{Kind, open};
 use serde_json::Value;
 
 fn arguments<'a>(scene: &'a str, spp: &'a str, output: &'a str, more: &[&'a str]) -> Vec<&'a str> {
@@ -166,6 +168,29 @@ fn another_size_of_a_prepared_scene_is_not_prepared_again() {
     }
 }
 
+fn report(folder: &Path) -> Value {
+    serde_json::from_slice(&bytes(folder, "r.json")).unwrap()
+}
+
+/// Tasks that are committed in the store, which one writer after the other wrote to: a record is a commit, or the whole state and how many
+/// commits led to it.
+fn committed(folder: &Path) -> u64 {
+    let mut records = files(&folder.join("s/jobs"));
+    records.retain(|path| path.parent().is_some_and(|folder| folder.ends_with("records")));
+    records.sort();
+    records.iter().fold(0, |commits, path| {
+        let json = open(Kind::RoundRecord, &fs::read(path).unwrap(), 1 << 30).unwrap();
+        let record: Value = serde_json::from_slice(&json).unwrap();
+        record["snapshot"]["commits"].as_u64().unwrap_or(commits + 1)
+    })
+}
+
+/// Whether a report says that so many tasks were taken over, and that none of what they made was lost.
+fn assert_reused(report: &Value, committed: u64) {
+    let found = ["tasks_reused", "tasks_redone"].map(|key| report[key].as_u64());
+    assert_eq!(found, [Some(committed), Some(0)], "{report}");
+}
+
 /// Waits until the store holds some commits of the child, which must still run then.
 fn wait_for_commits(folder: &Path, child: &mut Child) {
     let commits = || {
@@ -207,10 +232,11 @@ fn a_signal_ends_a_run_between_commits_and_leaves_no_temporary_folder() {
         assert_eq!(child.wait().unwrap().code(), Some(code));
         assert_eq!(folders(), 0);
     }
+    let held = committed(folder);
+    assert!(held >= 3, "{held}");
     let resumed = render(folder, "400", "x.exr", &["--store", "s", "--resume", "--report", "r.json"]);
     assert_eq!(resumed.code, 0, "{}", resumed.err);
-    let report: Value = serde_json::from_slice(&bytes(folder, "r.json")).unwrap();
-    assert!(report["tasks_reused"].as_u64() >= Some(3), "{report}");
+    assert_reused(&report(folder), held);
     assert_eq!(render(folder, "400", "whole.exr", &[]).code, 0);
     assert!(bytes(folder, "x.exr") == bytes(folder, "whole.exr"));
 }
@@ -231,16 +257,95 @@ fn a_killed_run_goes_on_and_a_live_one_is_refused() {
         .unwrap();
     wait_for_commits(folder, &mut child);
     let refused = render(folder, "200", "x.exr", &["--store", "s", "--resume"]);
-    assert_eq!(refused.code, 2, "{}", refused.err);
+    assert_mistake(&refused, &["s/", &format!("process {} writes to it", child.id()), "wait for it", "--takeover"]);
     assert!(child.try_wait().unwrap().is_none(), "it was done before the second could be refused");
     child.kill().unwrap();
     child.wait().unwrap();
+    let held = committed(folder);
+    assert!(held >= 3, "{held}");
 
     let resumed = render(folder, "200", "x.exr", &["--store", "s", "--resume", "--report", "r.json"]);
     assert_eq!(resumed.code, 0, "{}", resumed.err);
     assert!(bytes(folder, "x.exr") == bytes(folder, "whole.exr"));
-    let report: Value = serde_json::from_slice(&bytes(folder, "r.json")).unwrap();
-    assert!(report["tasks_reused"].as_u64() > Some(0), "{report}");
+    assert_reused(&report(folder), held);
     // previews of the killed run left no half-written file behind the picture's name
     assert!(bytes(folder, "x.png").starts_with(b"\x89PNG"));
+}
+
+#[test]
+fn a_live_writer_that_is_taken_over_ends() {
+    let folder = tempfile::tempdir().unwrap();
+    let folder = folder.path();
+    // more samples than anybody waits for
+    let slow = ["--store", "s", "--task-seconds", "0.02", "--threads", "1"];
+    let (scene, spp) = (scene(), "1000000");
+    let mut child = Command::new(env!("CARGO_BIN_EXE_rayherd"))
+        .args(arguments(&scene, spp, "old.exr", &slow))
+        .current_dir(folder)
+        .stdout(Stdio::null())
+        .stderr(Stdio::piped())
+        .spawn()
+        .unwrap();
+    wait_for_commits(folder, &mut child);
+    // `--takeover` alone would begin anew, which is refused before anybody is harmed
+    let anew = render(folder, spp, "new.exr", &["--store", "s", "--takeover"]);
+    assert_mistake(&anew, &["holds a job already", "resume"]);
+    assert!(child.try_wait().unwrap().is_none());
+    let taken = ["--store", "s", "--resume", "--takeover", "--time-limit", "0.1", "--report", "r.json"];
+    let taken = render(folder, spp, "new.exr", &taken);
+    assert_eq!(taken.code, 0, "{}", taken.err);
+    let begun = Instant::now();
+    while child.try_wait().unwrap().is_none() && begun.elapsed() < Duration::from_secs(60) {
+        std::thread::sleep(Duration::from_millis(5));
+    }
+    // a child that has ended is not killed
+    let _ = child.kill();
+    let code = child.wait().unwrap().code();
+    let mut told = String::new();
+    child.stderr.take().unwrap().read_to_string(&mut told).unwrap();
+    assert_eq!(code, Some(2), "{told}");
+    assert!(told.contains("error: ") && told.contains("was taken over by"), "{told}");
+    assert!(!folder.join("old.exr").exists());
+    // what the new writer made stands on what the old one had committed, and is what one run makes
+    let report = report(folder);
+    assert!(report["tasks_reused"].as_u64() >= Some(3), "{report}");
+    let spp = report["spp"].to_string();
+    assert_eq!(render(folder, &spp, "whole.exr", &[]).code, 0);
+    assert!(bytes(folder, "new.exr") == bytes(folder, "whole.exr"), "{spp} samples");
+}
+
+/// A run that stops by itself is gone on with as one that was told its samples.
+#[test]
+fn what_stopped_by_error_or_time_is_continued() {
+    let folder = tempfile::tempdir().unwrap();
+    let folder = folder.path();
+    for (store, limit) in [("e", ["--target-error", "0.2"]), ("t", ["--time-limit", "0.05"])] {
+        let kept = ["--store", store, "--resume", "--report", "r.json", "--task-seconds", "0.02"];
+        let run = |spp: &str, more: &[&str]| {
+            let run = render(folder, spp, "a.exr", &[&kept[..], more].concat());
+            assert_eq!(run.code, 0, "{limit:?}: {}", run.err);
+            report(folder)
+        };
+        let straight = |spp: &str| {
+            assert_eq!(render(folder, spp, "straight.exr", &[]).code, 0);
+            bytes(folder, "straight.exr")
+        };
+        let stopped = run("100000", &limit);
+        let spp = stopped["spp"].as_u64().unwrap();
+        assert!(spp < 100_000, "{limit:?}: it did not stop");
+        assert_eq!(stopped["target_reached"].as_bool(), (store == "e").then_some(true), "{stopped}");
+        assert!(bytes(folder, "a.exr") == straight(&spp.to_string()), "{limit:?} at {spp}");
+        // it stopped again at once: there is no reason to go on
+        if store == "e" {
+            assert_eq!(run("100000", &limit)["spp"], spp);
+        }
+        // an end that is no step's
+        let more = (spp + spp / 2 + 1).to_string();
+        let made = run(&more, &[]);
+        assert_eq!(made["tasks_reused"], stopped["tasks"], "{limit:?}");
+        assert!(bytes(folder, "a.exr") == straight(&more), "{limit:?} from {spp} to {more}");
+        // and onwards from there, to where the limit stops it
+        let further = run("100000", &limit)["spp"].as_u64().unwrap();
+        assert!(further > spp && bytes(folder, "a.exr") == straight(&further.to_string()), "{limit:?} to {further}");
+    }
 }
