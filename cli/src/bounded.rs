@@ -10,12 +10,15 @@ use crate::fault::Mistake;
 /// fills it.
 pub fn read(path: &Path, most: u64, remedy: &str) -> Result<Vec<u8>, Mistake> {
     let failed = |e| Mistake(format!("cannot read {}: {e}", path.display()));
-    let mut bytes = Vec::new();
-    File::open(path).and_then(|file| file.take(most + 1).read_to_end(&mut bytes)).map_err(failed)?;
-    if bytes.len() as u64 > most {
-        return Err(Mistake(format!("{} has more than {most} bytes: {remedy}", path.display())));
+    let too_long = || Mistake(format!("{} has more than {most} bytes: {remedy}", path.display()));
+    let file = File::open(path).map_err(failed)?;
+    // before memory is taken for any of it
+    if file.metadata().is_ok_and(|m| m.is_file() && m.len() > most) {
+        return Err(too_long());
     }
-    Ok(bytes)
+    let mut bytes = Vec::new();
+    file.take(most + 1).read_to_end(&mut bytes).map_err(failed)?;
+    if bytes.len() as u64 > most { Err(too_long()) } else { Ok(bytes) }
 }
 
 #[cfg(test)]

@@ -16,6 +16,9 @@ use serde_json::Value;
 
 /// Address space of a run. Most of it is threads' stacks and reserves; the inputs below ask for far more.
 const MIB: u64 = 4096;
+/// Memory of a run that is refused, at most: what is read of a bad input stays within the limits of its reader, the largest of which is that
+/// of XML.
+const MOST_MEMORY: u64 = 300 << 20;
 /// The longest error: what a terminal shows.
 const MOST_TEXT: usize = 2000;
 
@@ -62,12 +65,19 @@ impl Bed {
         self.run(&line.split(' ').collect::<Vec<_>>())
     }
 
-    /// Runs each row's command line, which must end with a mistake that names its parts.
+    /// Runs each row's command line, which must end with a mistake that names its parts, and within [`MOST_MEMORY`]; the most that one took,
+    /// bytes.
     #[track_caller]
-    fn mistakes(&self, rows: &[(&str, &[&str])]) {
+    fn mistakes(&self, rows: &[(&str, &[&str])]) -> Option<u64> {
+        let mut most = None;
         for (line, parts) in rows {
-            assert_error(line, &self.line(line), 2, parts);
+            let run = self.line(line);
+            assert_error(line, &run, 2, parts);
+            let peak = run.peak.map(|kib| kib << 10);
+            assert!(peak < Some(MOST_MEMORY), "{line}: {} MiB", peak.unwrap_or(0) >> 20);
+            most = most.max(peak);
         }
+        most
     }
 }
 
@@ -224,7 +234,7 @@ fn bombs() {
             format!("a0: &a0 [x]\n{rows}")
         })
         .write("nested.yaml", "[".repeat(1_000_000));
-    bed.mistakes(&[
+    let most = bed.mistakes(&[
         ("render doubling.xml", &["doubling.xml:21", "$a18x", "1048576 bytes", "<default>"]),
         ("render sum.xml", &["sum.xml:1", "$a17x", "67108864 bytes", "shorten the <default>s"]),
         ("render defaults.xml", &["defaults.xml:1", "$a17x", "67108864 bytes"]),
@@ -241,6 +251,11 @@ fn bombs() {
         ("render -f alias.yaml", &["alias.yaml"]),
         ("render -f nested.yaml", &["nested.yaml"]),
     ]);
+    match most {
+        // code alone takes some
+        Some(most) => assert!(most > 4 << 20, "{most} bytes"),
+        None => println!("this system does not tell a process's peak: only its address space is bounded"),
+    }
 }
 
 #[test]

@@ -47,7 +47,7 @@ impl Server {
 
 fn finish(output: std::process::Output) -> Run {
     let text = |bytes: Vec<u8>| String::from_utf8(bytes).unwrap();
-    Run { code: output.status.code().unwrap(), out: text(output.stdout), err: text(output.stderr) }
+    Run { code: output.status.code().unwrap(), out: text(output.stdout), err: text(output.stderr), peak: None }
 }
 
 fn scene() -> String {

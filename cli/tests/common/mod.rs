@@ -6,6 +6,8 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Output, Stdio};
 use std::time::{Duration, Instant};
 
+use rayherd_tests::mutation::peak_memory_of;
+
 /// What a run said.
 pub struct Run {
     /// Exit status.
@@ -14,6 +16,9 @@ pub struct Run {
     pub out: String,
     /// Standard error.
     pub err: String,
+    /// Of [`rayherd_bounded`]: most memory that it held, KiB, as far as it was seen by a look each millisecond; none where the system does not
+    /// tell.
+    pub peak: Option<u64>,
 }
 
 /// Runs `rayherd` in a folder.
@@ -27,7 +32,7 @@ pub fn rayherd(folder: &Path, arguments: &[&str]) -> Run {
         .expect("the binary starts");
     let text = |bytes: &[u8]| String::from_utf8(bytes.to_vec()).expect("UTF-8");
     let code = output.status.code().expect("it exits, not by a signal");
-    Run { code, out: text(&output.stdout), err: text(&output.stderr) }
+    Run { code, out: text(&output.stdout), err: text(&output.stderr), peak: None }
 }
 
 /// As [`rayherd`], with no more address space than so many MiB and no more time than two minutes: what takes more memory ends by a
@@ -49,19 +54,22 @@ pub fn rayherd_bounded(folder: &Path, mib: u64, arguments: &[&str]) -> Run {
     let out = read(Box::new(child.stdout.take().expect("piped")));
     let err = read(Box::new(child.stderr.take().expect("piped")));
     let end = Instant::now() + Duration::from_secs(120);
+    let mut peak = None;
     let status = loop {
+        // one that has ended has no memory
+        peak = peak_memory_of(child.id()).max(peak);
         match child.try_wait().expect("a child can be waited for") {
             Some(status) => break status,
             None if Instant::now() > end => {
                 child.kill().and_then(|()| child.wait()).expect("it can be killed");
                 panic!("{arguments:?} hangs");
             }
-            None => std::thread::sleep(Duration::from_millis(5)),
+            None => std::thread::sleep(Duration::from_millis(1)),
         }
     };
     let (out, err) = (out.join().expect("no panic"), err.join().expect("no panic"));
     let code = status.code().unwrap_or_else(|| panic!("{arguments:?} ended by a signal: {status}\n{err}"));
-    Run { code, out, err }
+    Run { code, out, err, peak }
 }
 
 /// Asserts that a run ended with a user's mistake, told in one message that holds `parts`.
