@@ -1,5 +1,6 @@
 //! What a prepared scene and a job leave in a store, damaged behind the checksums, and job files: read or refused, without a panic, in
-//! bounded time and memory. (Geometry, attributes, film, ray groups and envelopes alone are damaged where they are defined.)
+//! bounded time and memory. (Geometry, attributes, film, ray groups and envelopes alone are damaged where they are defined.) Pictures too: tiles of
+//! textures and the sky.
 
 use std::path::Path;
 use std::sync::{Arc, LazyLock};
@@ -11,6 +12,7 @@ use rayherd_herd::local::{collect, render_local};
 use rayherd_herd::store::{BlockStore, MemoryStore};
 use rayherd_herd::wire::envelope::{Compress, Kind, open, seal};
 use rayherd_render::frame::Frame;
+use rayherd_render::light::SkyMap;
 use rayherd_scene::import::{DescriptionSource, StreamOptions, import};
 use rayherd_scene::manifest::Manifest;
 use rayherd_scene::objects::{MemoryObjects, ObjectKind, ObjectRef, ObjectStore};
@@ -25,18 +27,47 @@ struct Job {
 }
 
 /// Spheres, rough metal and several lamps, in few pixels.
-static JOB: LazyLock<Job> = LazyLock::new(|| {
+static JOB: LazyLock<Job> =
+    LazyLock::new(|| job(&Path::new(env!("CARGO_MANIFEST_DIR")).join("../examples/veach-mis.xml")));
+
+/// A wall and a lamp with a picture each, under a picture of the sky.
+static PICTURES: LazyLock<Job> = LazyLock::new(|| {
+    let folder = Path::new(env!("CARGO_TARGET_TMPDIR")).join("wire-formats");
+    std::fs::create_dir_all(&folder).unwrap();
+    // 150 texels across are two tiles
+    for (name, width, height) in [("wall", 150u32, 3u32), ("lamp", 2, 2), ("sky", 6, 5)] {
+        let mut picture = format!("#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y {height} +X {width}\n").into_bytes();
+        picture
+            .extend((0..width * height).flat_map(|i| [40 + i as u8 % 200, 250 - i as u8 % 150, 9, 127 + i as u8 % 3]));
+        std::fs::write(folder.join(format!("{name}.hdr")), picture).unwrap();
+    }
+    let picture = |property: &str, name: &str| {
+        format!("<texture type='bitmap' name='{property}'><string name='filename' value='{name}.hdr'/></texture>")
+    };
+    let text = format!(
+        "<scene version='3.0.0'><emitter type='envmap'><string name='filename' value='sky.hdr'/></emitter>\n\
+         <shape type='rectangle'><bsdf type='twosided'><bsdf type='diffuse'>{}</bsdf></bsdf></shape>\n\
+         <shape type='sphere'><point name='center' x='0' y='0' z='1.5'/><float name='radius' value='0.3'/>\
+         <emitter type='area'>{}</emitter></shape></scene>",
+        picture("reflectance", "wall"),
+        picture("radiance", "lamp")
+    );
+    let scene = folder.join("scene.xml");
+    std::fs::write(&scene, text).unwrap();
+    job(&scene)
+});
+
+fn job(scene: &Path) -> Job {
     let mut spec = RenderJobSpec { splits: Some(3), ..RenderJobSpec::default() };
-    let scene = Path::new(env!("CARGO_MANIFEST_DIR")).join("../examples/veach-mis.xml");
     spec.scene.source = scene.to_string_lossy().into_owned();
     spec.image.size = Some("6x5".parse().unwrap());
-    let description = import(&scene, &import_options(&spec)).unwrap();
+    let description = import(scene, &import_options(&spec)).unwrap();
     let source = DescriptionSource::new(&description, StreamOptions::default());
     let objects = MemoryObjects::new();
     let (settings, spool) = (prepare_settings(&spec), SpoolSettings::default());
     let made = prepare(&description, &source, &settings, &spool, &objects, &NoProgress).unwrap();
     Job { spec, manifest: made.manifest, objects }
-});
+}
 
 fn settings(commits: Option<Commits>) -> JobSettings {
     JobSettings {
@@ -68,8 +99,12 @@ fn bounded(run: impl FnOnce()) {
 
 /// A scene under another manifest, with the objects of [`JOB`] and one more.
 fn scene(manifest: Manifest, more: &[u8]) -> Result<PreparedScene, JobError> {
+    scene_of(&JOB, manifest, more)
+}
+
+fn scene_of(job: &Job, manifest: Manifest, more: &[u8]) -> Result<PreparedScene, JobError> {
     let objects = MemoryObjects::new();
-    for bytes in JOB.objects.snapshot().values() {
+    for bytes in job.objects.snapshot().values() {
         objects.put(ObjectKind::Geometry, bytes).unwrap();
     }
     objects.put(ObjectKind::Geometry, more).unwrap();
@@ -113,6 +148,65 @@ fn scenes() {
     });
 }
 
+/// Tiles of textures and the sky of a scene that have the right hash, and lie: what has the size that it should have is rendered, whatever it
+/// shows.
+#[test]
+fn pictures() {
+    let job = &*PICTURES;
+    let frame = frame(&job.spec, &job.manifest, None).unwrap();
+    render(&scene_of(job, job.manifest.clone(), &[]).unwrap(), &frame, None).unwrap();
+    assert_eq!(job.manifest.tiles.len(), 3);
+    for (which, name) in ["tiles of textures", "sky of a scene"].into_iter().enumerate() {
+        bounded(|| {
+            let (mut rendered, mut refused) = (0, 0);
+            let rounds = mutation::rounds(name, 400, |random| {
+                let mut manifest = job.manifest.clone();
+                let entry = match which {
+                    0 => manifest.tiles.get_mut(random.below(3)),
+                    _ => manifest.sky_map.as_mut(),
+                };
+                let entry = entry.unwrap();
+                let bad = mutation::bytes(&job.objects.get(entry).unwrap(), random);
+                *entry = ObjectRef::of(&bad);
+                match scene_of(job, manifest, &bad).and_then(|scene| render(&scene, &frame, None)) {
+                    Ok(()) => rendered += 1,
+                    Err(e) => {
+                        assert!(e.is_users(), "{e}");
+                        refused += 1;
+                    }
+                }
+            });
+            println!("{name}: {rendered} rendered, {refused} refused");
+            assert!(
+                rounds.is_none_or(|n| rendered > n / 10 && refused > n / 10),
+                "{rendered}, {refused} of {rounds:?}"
+            );
+        });
+    }
+}
+
+/// The bytes of a sky alone: no map, or the map of these bytes, whose tables hold together.
+#[test]
+fn sky_maps() {
+    let object = PICTURES.manifest.sky_map.as_ref().unwrap();
+    let valid = PICTURES.objects.get(object).unwrap();
+    bounded(|| {
+        let (mut maps, mut refused) = (0, 0);
+        let rounds = mutation::rounds("sky map", 20_000, |random| {
+            let bad = mutation::bytes(&valid, random);
+            let Ok(map) = SkyMap::decode(&bad) else {
+                refused += 1;
+                return;
+            };
+            maps += 1;
+            assert!(map.encode() == bad);
+            let direction = map.sample([random.bits() as u32, random.bits() as u32]);
+            assert!(map.pdf(direction) >= 0.0 && map.radiance(direction).min_element() >= 0.0);
+        });
+        assert!(rounds.is_none_or(|n| maps > n / 10 && refused > n / 10), "{maps}, {refused} of {rounds:?}");
+    });
+}
+
 /// A manifest that is well-formed, and lies.
 #[test]
 fn manifests() {
@@ -148,7 +242,7 @@ async fn all(store: &dyn BlockStore) -> Objects {
 /// A job whose last round record has the right hash, and lies: it is gone on with, made again or refused, and collected.
 #[test]
 fn round_records() {
-    let runtime = tokio::runtime::Builder::new_current_thread().build().unwrap();
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_time().build().unwrap();
     let frame = frame(&JOB.spec, &JOB.manifest, None).unwrap();
     let whole = scene(JOB.manifest.clone(), &[]).unwrap();
     let store = Arc::new(MemoryStore::new());
