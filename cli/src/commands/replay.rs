@@ -12,7 +12,6 @@ use rayherd_render::bvh::{Kernel, Tracer};
 use rayherd_render::film::FilmPart;
 use rayherd_render::path::{Outcome, PathRay, ShadowRay, Surfaces, camera_ray, shade};
 use rayherd_render::ray::Hit;
-use rayherd_render::skip::Skips;
 
 use super::print;
 use super::render::OBJECTS_IN_MEMORY;
@@ -20,12 +19,14 @@ use crate::fault::Mistake;
 use crate::frames;
 use crate::image_options::ImageOptions;
 use crate::options::{self, SceneOptions, numbers};
+use crate::skip_options::SkipOptions;
 use crate::source;
 use crate::store::Temporary;
 
 /// Trace one sample of one pixel again and print every vertex of its path
 ///
-/// The scene's flags and those of the image (size, seed, depths, split, camera) must be those of the render.
+/// The scene's flags, those of the image (size, seed, depths, split, camera) and --no-skip must be those of the render. Which samples had a
+/// contribution that was not finite, the first 16 of them by pixel, is in its log and its report (non_finite_at).
 #[derive(Args)]
 #[command(after_help = "Example:\n  rayherd replay examples/cornell-box.xml --pixel 120,80 --sample 7")]
 pub struct Arguments {
@@ -41,6 +42,8 @@ pub struct Arguments {
     image: ImageOptions,
     #[command(flatten)]
     scene_options: SceneOptions,
+    #[command(flatten)]
+    skip: SkipOptions,
 }
 
 /// Prints the path.
@@ -49,17 +52,19 @@ pub fn run(arguments: &Arguments) -> anyhow::Result<ExitCode> {
     spec.scene.source.clone_from(&arguments.scene);
     arguments.scene_options.apply(&mut spec);
     arguments.image.apply(&mut spec);
+    arguments.skip.apply(&mut spec);
+    let skips = arguments.skip.skips();
     let job = RenderJob::new(spec);
     options::check(&job, None)?;
     let temporary = Temporary::new(OBJECTS_IN_MEMORY)?;
     let objects = temporary.objects.clone();
-    let prepared = source::open(&job.spec, objects.as_ref(), &[], Skips::ALL)?.prepared;
+    let prepared = source::open(&job.spec, objects.as_ref(), &[], skips)?.prepared;
     let frame = frames::frame(&job, &prepared.manifest, job.spec.image.cameras.first())?;
     let ([x, y], [width, height]) = (arguments.pixel, frame.size);
     if x >= width || y >= height {
         return Err(Mistake(format!("--pixel {x},{y} lies outside the image of {width}x{height}")).into());
     }
-    let scene = PreparedScene::open(prepared.manifest, objects)?;
+    let scene = PreparedScene::open(prepared.manifest, objects)?.skipping(skips);
     let all: Vec<u32> = (0..scene.splits()).collect();
     let resident = Resident::load(&scene, &all, &scene)?;
     let surfaces = resident.surfaces(&scene, &scene)?;
