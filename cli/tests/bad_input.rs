@@ -343,11 +343,26 @@ fn nothing_to_see_or_to_see_by() {
     ]);
 
     // without a camera a scene is framed; what is unusable is skipped, counted and reported
-    let camera = "a camera is placed";
     bed.write("some.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nv nan 0 0\nv 2 0 0\nf 1 2 3\nf 1 2 4\nf 1 2 5\n");
     bed.xml("plain.xml", &format!("<shape type='obj'><string name='filename' value='some.obj'/></shape>{LIT}"));
+    let run = bed.line("check plain.xml");
+    assert!(
+        run.code == 0 && run.out.contains("camera       perspective"),
+        "a camera is placed: {}{}",
+        run.out,
+        run.err
+    );
     let run = bed.line("render plain.xml --spp 1 --size 8x8 --report r.json");
-    assert_eq!(run.code, 0, "{camera}: {}", run.err);
+    assert_eq!(run.code, 0, "{}", run.err);
+    // it sees the triangle, and what is around it
+    let pixels = exr::prelude::read_first_rgba_layer_from_file(
+        bed.path().join("plain.exr"),
+        |_, _| vec![],
+        |values: &mut Vec<f32>, _, (r, ..): (f32, f32, f32, f32)| values.push(r),
+    );
+    let pixels = pixels.unwrap().layer_data.channel_data.pixels;
+    let sky = pixels.iter().filter(|v| **v == 1.0).count();
+    assert!(pixels.len() == 64 && (8..=62).contains(&sky), "{sky} of {} pixels see the sky", pixels.len());
     let report: Value = serde_json::from_slice(&fs::read(bed.path().join("r.json")).unwrap()).unwrap();
     let counts = &report["prepare"]["counts"];
     let found = ["records", "triangles", "degenerate", "non_finite"].map(|key| counts[key].as_u64());

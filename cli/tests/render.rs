@@ -6,6 +6,7 @@ use std::fs;
 use std::path::Path;
 
 use common::{Run, assert_mistake, rayherd, repository};
+use rayherd_render::bvh::{Kernel, Tracer};
 use serde_json::Value;
 
 fn cornell(folder: &Path, output: &str, more: &[&str]) -> Run {
@@ -34,12 +35,25 @@ fn the_files_are_the_same_however_it_runs() {
     for more in [
         &["--threads", "2"][..],
         &["--kernel", "scalar", "--threads", "1"],
+        &["--splits", "3", "--kernel", "auto", "--strategy", "scheduling-grid"],
         &["--splits", "5", "--strategy", "demand-driven", "--nodes", "2", "--slots", "1", "--replicas", "2"],
         &["--splits", "3", "--strategy", "scheduling-grid", "--slots", "1,2", "--barrier", "off"],
         &["--block-size", "1Ki", "--strategy", "scheduling-grid-overlap-reduced", "--memory", "4KiB"],
         &["--splits", "4", "--nodes", "3", "--memory", "2Ki", "--task-seconds", "0.01"],
     ] {
         assert!(run("b.exr", more) == first, "{more:?}");
+    }
+    // the machine's kernels, where every ray stays in its task and where rays travel
+    for (name, kernel) in [("scalar", Kernel::Scalar), ("avx2", Kernel::Avx2), ("avx512", Kernel::Avx512)] {
+        if Tracer::new(kernel).is_err() {
+            println!("this machine has no {name}: not compared");
+            continue;
+        }
+        let travel =
+            ["--kernel", name, "--splits", "3", "--strategy", "scheduling-grid-overlap-reduced", "--nodes", "2"];
+        for more in [&["--kernel", name][..], &travel] {
+            assert!(run("b.exr", more) == first, "{more:?}");
+        }
     }
     // another image is another file: the header says which
     assert!(run("c.exr", &["--seed", "1"]) != first);
@@ -59,6 +73,7 @@ fn the_files_are_the_same_however_it_runs() {
     let mut keys: Vec<&String> = report.as_object().unwrap().keys().collect();
     keys.sort_unstable();
     assert_eq!(keys, documented);
+    assert_nested_keys(&report, &text);
     let moved = |stage: &str, kind: &str| {
         let rows = report["bytes"].as_array().unwrap().iter();
         rows.filter(|r| r["stage"] == stage && r["kind"] == kind).map(|r| r["bytes"].as_u64().unwrap()).sum::<u64>()
@@ -68,6 +83,104 @@ fn the_files_are_the_same_however_it_runs() {
     assert!(moved("prepare", "geometry") > 0 && moved("prepare", "manifest") > 0);
     assert_eq!(report["samples"], 16 * 16 * 4);
     assert_eq!(report["prepare"]["counts"]["triangles"], 36);
+}
+
+/// Keys inside of keys: those that are here and no others, each named in its key's row.
+#[track_caller]
+fn assert_nested_keys(report: &Value, documentation: &str) {
+    for (place, expected) in [
+        ("rays", &["camera", "closest", "merged", "shadow"][..]),
+        ("bytes", &["bytes", "kind", "op", "place", "stage"]),
+        ("nodes_detail", &["busy", "peak_scene_bytes", "peak_texture_bytes", "reads", "remote_reads", "slots"]),
+        ("skipped", &["degenerate", "non_finite", "out_of_range"]),
+        (
+            "prepare",
+            &[
+                "choice",
+                "contested_share",
+                "copied_splits",
+                "counts",
+                "reused",
+                "scene",
+                "splits",
+                "subdiv",
+                "substitutions",
+                "took",
+            ],
+        ),
+    ] {
+        let row = documentation.lines().find(|l| l.starts_with(&format!("| `{place}`"))).unwrap();
+        let values = report[place].as_array().map_or(vec![&report[place]], |rows| rows.iter().collect());
+        assert!(!values.is_empty(), "{place}");
+        for value in values {
+            let mut keys: Vec<&String> = value.as_object().unwrap().keys().collect();
+            keys.sort_unstable();
+            assert_eq!(keys, expected, "{place}");
+        }
+        for key in expected {
+            assert!(row.contains(&format!("`{key}`")), "{key} of {place} is not in {row}");
+        }
+    }
+}
+
+/// A stand-in is told in the log, with its place, and in the report.
+#[test]
+fn stand_ins_are_told() {
+    let folder = tempfile::tempdir().unwrap();
+    let text = "<scene version='3.0.0'>\n<shape type='rectangle'>\n<bsdf type='ward'/></shape>\n<emitter type='constant'/></scene>";
+    fs::write(folder.path().join("s.xml"), text).unwrap();
+    let render = ["render", "s.xml", "--size", "8x8", "--spp", "1", "--report", "r.json"];
+    assert_mistake(&rayherd(folder.path(), &render), &["s.xml:3: bsdf \"ward\"", "--substitute"]);
+    assert!(!folder.path().join("s.exr").exists() && !folder.path().join("r.json").exists());
+    let run = rayherd(folder.path(), &[&render[..], &["--substitute"]].concat());
+    assert_eq!(run.code, 0, "{}", run.err);
+    let warning = "s.xml:3: bsdf \"ward\" is not supported; in its place: ";
+    let stand_in = run.err.lines().find_map(|l| l.split_once(warning)).unwrap_or_else(|| panic!("{}", run.err)).1;
+    assert!(stand_in.contains("diffuse"), "{stand_in}");
+    let report: Value = serde_json::from_slice(&fs::read(folder.path().join("r.json")).unwrap()).unwrap();
+    let told = report["prepare"]["substitutions"].as_array().unwrap();
+    assert_eq!(told.len(), 1, "{told:?}");
+    assert_eq!((&told[0]["what"], &told[0]["stand_in"]), (&"bsdf \"ward\"".into(), &stand_in.into()), "{told:?}");
+    assert_eq!(told[0]["place"]["line"], 3, "{told:?}");
+}
+
+/// What a job file says of lights, sky and albedo is what the flags say, to the byte; and each of them counts.
+#[test]
+fn a_job_file_lights_a_mesh_as_the_flags_do() {
+    let folder = tempfile::tempdir().unwrap();
+    let folder = folder.path();
+    fs::write(folder.join("a.obj"), "v -1 0 -1\nv 1 0 -1\nv 1 0 1\nv -1 0.5 1\nf 1 4 3 2\n").unwrap();
+    let job = "
+apiVersion: rayherd.io/v1alpha1
+kind: RenderJob
+spec:
+  scene:
+    source: a.obj
+    albedo: [0.8, 0.4, 0.2]
+    sky: [0.1, 0.2, 0.3]
+    lights:
+    - {origin: [0, 3, 0], target: [0, 0, 0], size: [1, 0.5], radiance: [9, 8, 7]}
+    - {origin: [2, 2, 0], target: [0, 0, 0], size: [0.5, 0.5], radiance: [4]}
+  image: {size: 12x10}
+  sampling: {spp: 3}
+";
+    fs::write(folder.join("job.yaml"), job).unwrap();
+    let picture = |arguments: &[&str]| {
+        let run = rayherd(folder, &[&["render"], arguments, &["-o", "x.exr"]].concat());
+        assert_eq!(run.code, 0, "{arguments:?}: {}", run.err);
+        fs::read(folder.join("x.exr")).unwrap()
+    };
+    let image = ["a.obj", "--size", "12x10", "--spp", "3"];
+    let lights = ["--light", "0,3,0,0,0,0,1,0.5,9,8,7", "--light", "2,2,0,0,0,0,0.5,0.5,4"];
+    let (sky, albedo) = (["--sky", "0.1,0.2,0.3"], ["--albedo", "0.8,0.4,0.2"]);
+    let of_job = picture(&["-f", "job.yaml"]);
+    assert!(of_job == picture(&[&image[..], &lights, &sky, &albedo].concat()));
+    for parts in [[&lights[..2], &sky, &albedo], [&lights[..], &[], &albedo], [&lights[..], &sky, &[]]] {
+        assert!(of_job != picture(&[&image[..], &parts.concat()].concat()), "{parts:?}");
+    }
+    // and a flag wins over the file
+    let flag = picture(&["-f", "job.yaml", "--sky", "0"]);
+    assert!(flag == picture(&[&image[..], &lights, &["--sky", "0"], &albedo].concat()) && flag != of_job);
 }
 
 #[test]

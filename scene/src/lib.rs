@@ -39,7 +39,7 @@ pub enum ImportError {
         message: String,
     },
     /// Elements that are not supported, all of them.
-    #[error("{} unsupported element(s):\n{}", .0.len(), list(.0))]
+    #[error("{} unsupported element(s), for which --substitute takes stand-ins:\n{}", .0.len(), list(.0))]
     Unsupported(Vec<(Place, String)>),
     /// A limit was passed before memory was taken.
     #[error("{file}: {message}", file = path.display())]
