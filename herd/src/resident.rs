@@ -219,7 +219,7 @@ impl Surfaces for ResidentSurfaces<'_> {
             shape: attributes.shape(local),
             geometry: self.resident.forest.primitive(hit),
             normals: attributes.normals(local),
-            uv: attributes.block.uvs.get(local).copied(),
+            uv: attributes.block.uv(local),
             attribute: attributes.block.attributes.get(local).copied(),
         }
     }

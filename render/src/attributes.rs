@@ -14,11 +14,15 @@ pub struct AttributeBlock {
     pub shapes: Vec<u32>,
     /// Shading normals of the three vertices of each primitive, or empty when none has any. Zeros: this one has none.
     pub normals: Vec<[[f32; 3]; 3]>,
-    /// Texture coordinates of the three vertices of each primitive, or empty when none has any.
+    /// Texture coordinates of the three vertices of each primitive, or empty when none has any. NaN ([`NO_UV`]): this one has none, whatever the
+    /// others beside it have, so that how a scene is cut shows nowhere.
     pub uvs: Vec<[[f32; 2]; 3]>,
     /// The mesh's attribute at the three vertices of each primitive, or empty when none has any.
     pub attributes: Vec<[[f32; 3]; 3]>,
 }
+
+/// Texture coordinates of a primitive that has none among some that have; zeros would be coordinates.
+pub const NO_UV: [[f32; 2]; 3] = [[f32::NAN; 2]; 3];
 
 /// Why bytes are no attribute block.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
@@ -48,6 +52,12 @@ pub enum AttributeError {
 }
 
 impl AttributeBlock {
+    /// Texture coordinates of a primitive, if it has any.
+    #[inline(always)]
+    pub fn uv(&self, local: usize) -> Option<[[f32; 2]; 3]> {
+        self.uvs.get(local).copied().filter(|uv| !uv[0][0].is_nan())
+    }
+
     /// The block as bytes.
     ///
     /// # Panics

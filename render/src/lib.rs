@@ -6,6 +6,7 @@
 // `!(x > 0.0)` is true of NaN, which is what is meant
 #![allow(clippy::neg_cmp_op_on_partial_ord)]
 
+pub mod aov;
 pub mod attributes;
 pub mod bvh;
 pub mod camera;

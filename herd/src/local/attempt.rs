@@ -3,7 +3,8 @@
 use std::cell::OnceCell;
 use std::collections::BTreeMap;
 
-use rayherd_render::film::FilmPart;
+use rayherd_render::aov::Aovs;
+use rayherd_render::film::{FilmPart, Layout};
 use rayherd_render::frame::Frame;
 use rayherd_render::path::{Context, PathRay};
 use rayherd_render::skip::{Skip, SkipCounts};
@@ -104,7 +105,8 @@ pub fn run(shared: &Shared, attempt: &Attempt, stop: &dyn Stop) -> Result<Made, 
     let sink = Store { shared, attempt };
     let mut groups = Groups::new(&sink, shared.settings.ray_buffer);
     let skips = shared.scene.skips();
-    let mut film = FilmPart::new(shared.frame.size);
+    let aovs = if skips.makes(Skip::Aovs) { shared.frame.aovs } else { Aovs::ALL };
+    let mut film = FilmPart::new(Layout { aovs, ..shared.frame.layout() });
     let mut camera = CameraFeed::new(shared.frame, attempt.camera.clone(), skips);
     let mut trace = Loop::new(shared.settings.kernel, shared.settings.batch as usize, skips)?;
     let tiles = shared.nodes.blocks(attempt.node);
@@ -129,6 +131,7 @@ pub fn run(shared: &Shared, attempt: &Attempt, stop: &dyn Stop) -> Result<Made, 
     }
     let unread = task.unread;
     textures.check()?;
+    film.keep_aovs(shared.frame.aovs);
     if !skips.makes(Skip::Film) {
         film.touch_all();
     }
@@ -139,7 +142,7 @@ pub fn run(shared: &Shared, attempt: &Attempt, stop: &dyn Stop) -> Result<Made, 
     let rays = trace.rays;
     let groups = groups.finish()?;
     let non_finite = film.rejected().count;
-    let film_ref = if shared.store_film && (film.touched() > 0 || non_finite > 0) {
+    let film_ref = if shared.store_film && !film.is_empty() {
         let key = format!("film/{}", attempt.name);
         let body = codec::encode_film(&film);
         let bytes = body.len() as u64;

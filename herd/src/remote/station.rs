@@ -374,14 +374,14 @@ impl<'l> Station<'l> {
         spp: u32,
         picture: Option<&str>,
     ) -> Result<Done, JobError> {
-        let (nodes, size) = (&shared.nodes, shared.frame.size);
-        let mut sum = FilmPart::new(size);
+        let (nodes, layout) = (&shared.nodes, shared.frame.layout());
+        let mut sum = FilmPart::new(layout);
         for part in parts {
-            let open = |body: &bytes::Bytes| codec::decode_film(size, body);
+            let open = |body: &bytes::Bytes| codec::decode_film(layout, body);
             sum.merge(&nodes.get(self.node(), Kind::Film, &part.key, &part.holders, open)?)?;
         }
         let film = match name {
-            Some(key) if sum.touched() > 0 || sum.rejected().count > 0 => {
+            Some(key) if !sum.is_empty() => {
                 let body = codec::encode_film(&sum);
                 let bytes = body.len() as u64;
                 let holders = nodes.put(self.node(), Kind::Film, key, body)?;
@@ -403,7 +403,8 @@ impl<'l> Station<'l> {
         spp: u32,
         key: &str,
     ) -> Result<Vec<String>, JobError> {
-        let body = picture::encode(&image_of(sum, spp), &definition(&scene.manifest, frame, spp)?)?;
+        let channels = sum.channels(spp, scene.manifest.offset);
+        let body = picture::encode(&image_of(sum, spp), &channels, &definition(&scene.manifest, frame, spp)?)?;
         let body = bytes::Bytes::from(body);
         let mut at = Vec::new();
         let mut error = None;

@@ -5,7 +5,7 @@ use std::sync::atomic::{AtomicU32, Ordering};
 use std::sync::{Arc, LazyLock, Mutex};
 use std::time::{Duration, Instant};
 
-use rayherd_api::{RenderJobSpec, Strategy};
+use rayherd_api::{Aov, RenderJobSpec, Strategy};
 use rayherd_scene::import::{DescriptionSource, StreamOptions, import};
 use rayherd_scene::objects::{MemoryObjects, ObjectRef};
 use rayherd_scene::prepare::{NoProgress, SpoolSettings, prepare};
@@ -116,6 +116,8 @@ fn spec(strategy: Strategy, splits: i64, replicas: i32) -> RenderJobSpec {
         RenderJobSpec { strategy, splits: Some(splits), replicas: Some(replicas), ..RenderJobSpec::default() };
     spec.scene.source = SOURCE.into();
     spec.image.size = Some("48x40".parse().unwrap());
+    // of some jobs the picture has layers
+    spec.image.aovs = (replicas == 2).then(|| Aov::ALL.to_vec());
     spec.sampling.spp = Some(6);
     spec.sampling.max_depth = Some(5);
     spec.task_seconds = Some(0.01);
@@ -137,7 +139,12 @@ fn expected(spec: &RenderJobSpec) -> Vec<u8> {
     let frame = from_spec::frame(spec, &scene.manifest, None).unwrap();
     let sampling = Sampling { spp: 6, target_error: None, time_limit: None };
     let out = render_local(&scene, &frame, &sampling, &JobSettings::default(), &Silent).unwrap();
-    picture::encode(&out.image, &from_spec::definition(&scene.manifest, &frame, out.spp).unwrap()).unwrap()
+    picture::encode(
+        &out.image,
+        &out.film.channels(out.spp, scene.manifest.offset),
+        &from_spec::definition(&scene.manifest, &frame, out.spp).unwrap(),
+    )
+    .unwrap()
 }
 
 struct Cluster {

@@ -5,17 +5,22 @@
 //! than 0; six header bytes for each of those (half by half, channel by channel); the values' bytes in the same order. A value is
 //! stored without the zero bytes at its low end and without the bytes of mere sign at its high end: the header's low nibble is the
 //! number of zero bytes below, its high nibble the number of bytes less 1. 0xff stands for a value of 0.
+//!
+//! With AOVs the first four bytes are `RHF2`; after the height comes a bit for each AOV, u16, and at the end the number of their tiles u32,
+//! and these tiles in the same form, with as many values for each pixel as the AOVs have sums.
 
-use super::{FilmPart, KEPT_KEYS, Rejected, TILE, Tile};
+use super::{FilmPart, KEPT_KEYS, Layout, Planes, Rejected, TILE, Tile};
+use crate::aov::Aovs;
 
 const MAGIC: &[u8; 4] = b"RHF1";
+const MAGIC_AOVS: &[u8; 4] = b"RHF2";
 const ZERO: u8 = 0xff;
 
 /// Why bytes are no film part, or parts do not belong together.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum FilmError {
     /// Not this format, or another version of it.
-    #[error("this is no film part of version 1")]
+    #[error("this is no film part of version 1 or 2")]
     Magic,
     /// Ends too early.
     #[error("the film part is cut off at byte {0}")]
@@ -28,6 +33,14 @@ pub enum FilmError {
         /// Of the part.
         found: [u32; 2],
     },
+    /// With other AOVs.
+    #[error("a film part with these AOVs: {found}; expected: {expected}")]
+    Aovs {
+        /// Of this film.
+        expected: Aovs,
+        /// Of the part.
+        found: Aovs,
+    },
     /// Content that `encode` never writes.
     #[error("the film part is corrupt at byte {0}")]
     Corrupt(usize),
@@ -36,65 +49,87 @@ pub enum FilmError {
 impl FilmPart {
     /// The part as bytes, the same for the same sums.
     pub fn encode(&self) -> Vec<u8> {
+        let aovs = self.planes.aovs;
         let mut out = Vec::new();
-        out.extend(MAGIC);
+        out.extend(if aovs.is_empty() { MAGIC } else { MAGIC_AOVS });
         out.extend(self.size[0].to_le_bytes());
         out.extend(self.size[1].to_le_bytes());
+        if !aovs.is_empty() {
+            out.extend(aovs.bits().to_le_bytes());
+        }
         out.extend(self.rejected.count.to_le_bytes());
         out.push(self.rejected.keys.len() as u8);
         for (pixel, sample) in &self.rejected.keys {
             out.extend(pixel.to_le_bytes());
             out.extend(sample.to_le_bytes());
         }
-        out.extend((self.touched() as u32).to_le_bytes());
-        let mut body = Vec::new();
-        for (number, tile) in self.tiles.iter().enumerate() {
-            let Some(tile) = tile else { continue };
-            out.extend((number as u32).to_le_bytes());
-            let bitmap = out.len();
-            out.resize(bitmap + (TILE * TILE / 8) as usize, 0);
-            body.clear();
-            for (i, sums) in tile.0.iter().enumerate() {
-                if sums.as_flattened().iter().all(|&s| s == 0) {
-                    continue;
-                }
-                out[bitmap + i / 8] |= 1 << (i % 8);
-                for &sum in sums.as_flattened() {
-                    out.push(push_value(&mut body, sum));
-                }
-            }
-            out.extend(&body);
+        push_tiles(&mut out, 6, self.tiles.iter().map(|t| t.as_ref().map(|t| t.0.as_flattened().as_flattened())));
+        if !aovs.is_empty() {
+            push_tiles(&mut out, self.planes.stride, self.planes.tiles.iter().map(Option::as_deref));
         }
         out
     }
 
-    /// From bytes of a film of `size` pixels; reads no more memory than the film has tiles.
-    pub fn decode(bytes: &[u8], size: [u32; 2]) -> Result<FilmPart, FilmError> {
+    /// From bytes of a film of this layout; takes no more memory than the film has tiles.
+    pub fn decode(bytes: &[u8], layout: impl Into<Layout>) -> Result<FilmPart, FilmError> {
+        let layout @ Layout { size, aovs } = layout.into();
         let mut r = Reader { bytes, at: 0 };
-        if r.take(4)? != MAGIC {
+        let magic = r.take(4)?;
+        if magic != MAGIC && magic != MAGIC_AOVS {
             return Err(FilmError::Magic);
         }
         let found = [r.u32()?, r.u32()?];
         if found != size {
             return Err(FilmError::Size { expected: size, found });
         }
-        let mut part = FilmPart::new(size);
+        let found = if magic == MAGIC { Aovs::NONE } else { r.aovs()? };
+        if found != aovs {
+            return Err(FilmError::Aovs { expected: aovs, found });
+        }
+        let mut part = FilmPart::new(layout);
         part.rejected = r.rejected(size[0] as u64 * size[1] as u64)?;
-        let mut next = 0;
-        for _ in 0..r.u32()? {
-            let place = r.at;
-            let number = r.u32()? as usize;
-            if number < next || number >= part.tiles.len() {
-                return Err(FilmError::Corrupt(place));
-            }
-            next = number + 1;
-            let tile = r.tile()?;
+        r.tiles(part.tiles.len(), |r, number| {
+            let mut tile = Tile::new();
+            r.tile(6, tile.0.as_flattened_mut().as_flattened_mut())?;
             part.tiles[number] = Some(tile);
+            Ok(())
+        })?;
+        if !aovs.is_empty() {
+            let stride = part.planes.stride;
+            r.tiles(part.planes.tiles.len(), |r, number| {
+                let mut tile = Planes::tile(stride);
+                r.tile(stride, &mut tile)?;
+                part.planes.tiles[number] = Some(tile);
+                Ok(())
+            })?;
         }
         if r.at != bytes.len() {
             return Err(FilmError::Corrupt(r.at));
         }
         Ok(part)
+    }
+}
+
+/// Appends tiles, each of `stride` values for each pixel.
+fn push_tiles<'a>(out: &mut Vec<u8>, stride: usize, tiles: impl Iterator<Item = Option<&'a [i128]>> + Clone) {
+    out.extend((tiles.clone().flatten().count() as u32).to_le_bytes());
+    let mut body = Vec::new();
+    for (number, tile) in tiles.enumerate() {
+        let Some(tile) = tile else { continue };
+        out.extend((number as u32).to_le_bytes());
+        let bitmap = out.len();
+        out.resize(bitmap + (TILE * TILE / 8) as usize, 0);
+        body.clear();
+        for (i, sums) in tile.chunks_exact(stride).enumerate() {
+            if sums.iter().all(|&s| s == 0) {
+                continue;
+            }
+            out[bitmap + i / 8] |= 1 << (i % 8);
+            for &sum in sums {
+                out.push(push_value(&mut body, sum));
+            }
+        }
+        out.extend(&body);
     }
 }
 
@@ -129,6 +164,13 @@ impl<'a> Reader<'a> {
         Ok(u32::from_le_bytes(self.take(4)?.try_into().map_err(|_| FilmError::Truncated(self.at))?))
     }
 
+    fn aovs(&mut self) -> Result<Aovs, FilmError> {
+        let place = self.at;
+        let bytes = self.take(2)?;
+        let aovs = Aovs::from_bits(u16::from_le_bytes([bytes[0], bytes[1]]));
+        aovs.filter(|a| !a.is_empty()).ok_or(FilmError::Corrupt(place))
+    }
+
     fn rejected(&mut self, pixels: u64) -> Result<Rejected, FilmError> {
         let count = u64::from(self.u32()?) | u64::from(self.u32()?) << 32;
         let place = self.at;
@@ -148,23 +190,42 @@ impl<'a> Reader<'a> {
         Ok(out)
     }
 
-    fn tile(&mut self) -> Result<Tile, FilmError> {
+    /// Hands each tile's number over, of `most`, to read its sums.
+    fn tiles(
+        &mut self,
+        most: usize,
+        mut each: impl FnMut(&mut Self, usize) -> Result<(), FilmError>,
+    ) -> Result<(), FilmError> {
+        let mut next = 0;
+        for _ in 0..self.u32()? {
+            let place = self.at;
+            let number = self.u32()? as usize;
+            if number < next || number >= most {
+                return Err(FilmError::Corrupt(place));
+            }
+            next = number + 1;
+            each(self, number)?;
+        }
+        Ok(())
+    }
+
+    /// The sums of a tile, which are 0 before, `stride` for each pixel.
+    fn tile(&mut self, stride: usize, tile: &mut [i128]) -> Result<(), FilmError> {
         let bitmap = self.take((TILE * TILE / 8) as usize)?;
         let touched: usize = bitmap.iter().map(|b| b.count_ones() as usize).sum();
         let headers_at = self.at;
-        let headers = self.take(6 * touched)?;
-        let mut tile = Tile::new();
+        let headers = self.take(stride * touched)?;
         let mut next = 0;
-        for (i, sums) in tile.0.iter_mut().enumerate() {
+        for (i, sums) in tile.chunks_exact_mut(stride).enumerate() {
             if bitmap[i / 8] >> (i % 8) & 1 == 0 {
                 continue;
             }
-            for sum in sums.as_flattened_mut() {
+            for sum in sums {
                 *sum = self.value(headers[next], headers_at + next)?;
                 next += 1;
             }
         }
-        Ok(tile)
+        Ok(())
     }
 
     fn value(&mut self, header: u8, place: usize) -> Result<i128, FilmError> {

@@ -6,8 +6,11 @@
 //!
 //! A contribution that is not finite, is negative, or is 2^38 or more is not added: it is counted, and the smallest
 //! [`KEPT_KEYS`] of the (pixel, sample) that made one are kept to replay them. Sums stay exact below 2^63 per pixel and half.
+//!
+//! AOVs are summed likewise, beside the light ([`FilmPart::add_aov`]); without any a film is what it is without them.
 
 mod code;
+mod planes;
 mod resolve;
 #[cfg(test)]
 mod tests;
@@ -15,6 +18,10 @@ mod tests;
 use std::collections::BTreeSet;
 
 pub use code::FilmError;
+pub use resolve::Channel;
+
+use crate::aov::Aovs;
+use planes::Planes;
 
 /// Width and height of a tile in pixels.
 pub const TILE: u32 = 32;
@@ -37,11 +44,28 @@ impl Tile {
     }
 }
 
+/// What a film holds: only films of one layout add up.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub struct Layout {
+    /// Width and height in pixels, each from 1 to 65535.
+    pub size: [u32; 2],
+    /// What is taken beside light.
+    pub aovs: Aovs,
+}
+
+impl From<[u32; 2]> for Layout {
+    /// Light alone.
+    fn from(size: [u32; 2]) -> Layout {
+        Layout { size, aovs: Aovs::NONE }
+    }
+}
+
 /// A film, or the part of one that some task filled.
 #[derive(Clone, PartialEq, Eq, Debug)]
 pub struct FilmPart {
     size: [u32; 2],
     tiles: Vec<Option<Tile>>,
+    planes: Planes,
     rejected: Rejected,
 }
 
@@ -64,10 +88,11 @@ impl Rejected {
 }
 
 impl FilmPart {
-    /// An empty film of `size` pixels, each way from 1 to 65535.
-    pub fn new(size: [u32; 2]) -> FilmPart {
+    /// An empty film; of a size alone one without AOVs.
+    pub fn new(layout: impl Into<Layout>) -> FilmPart {
+        let Layout { size, aovs } = layout.into();
         let tiles = size[0].div_ceil(TILE) as usize * size[1].div_ceil(TILE) as usize;
-        FilmPart { size, tiles: vec![None; tiles], rejected: Rejected::default() }
+        FilmPart { size, tiles: vec![None; tiles], planes: Planes::new(aovs, tiles), rejected: Rejected::default() }
     }
 
     /// Width and height in pixels.
@@ -80,7 +105,12 @@ impl FilmPart {
         &self.rejected
     }
 
-    /// Tiles that were touched.
+    /// Whether there is nothing to keep: no light, no AOV, nothing rejected.
+    pub fn is_empty(&self) -> bool {
+        self.touched() == 0 && self.planes.tiles.iter().all(Option::is_none) && self.rejected.count == 0
+    }
+
+    /// Tiles that light touched.
     pub fn touched(&self) -> usize {
         self.tiles.iter().flatten().count()
     }
@@ -93,11 +123,13 @@ impl FilmPart {
     /// Touches all tiles, so that all are held and stored.
     pub fn touch_all(&mut self) {
         self.tiles.iter_mut().for_each(|tile| _ = tile.get_or_insert_with(Tile::new));
+        self.planes.touch_all();
     }
 
     /// Memory of the sums in bytes.
     pub fn memory(&self) -> usize {
-        self.touched() * (TILE * TILE) as usize * size_of::<Sums>() + self.tiles.len() * size_of::<Option<Tile>>()
+        let light = self.touched() * (TILE * TILE) as usize * size_of::<Sums>();
+        light + self.tiles.len() * size_of::<Option<Tile>>() + self.planes.memory()
     }
 
     /// Adds a contribution to pixel `y * width + x` (below width * height).
@@ -135,7 +167,11 @@ impl FilmPart {
     /// Tile of a pixel, and its place in the tile.
     #[inline]
     fn place(&self, pixel: u32) -> (usize, usize) {
-        let (x, y) = (pixel % self.size[0], pixel / self.size[0]);
+        self.place_at(pixel % self.size[0], pixel / self.size[0])
+    }
+
+    #[inline(always)]
+    fn place_at(&self, x: u32, y: u32) -> (usize, usize) {
         let tile = y / TILE * self.size[0].div_ceil(TILE) + x / TILE;
         (tile as usize, (y % TILE * TILE + x % TILE) as usize)
     }
@@ -151,6 +187,7 @@ impl FilmPart {
         if self.size != other.size {
             return Err(FilmError::Size { expected: self.size, found: other.size });
         }
+        self.planes.merge(&other.planes)?;
         for (mine, theirs) in self.tiles.iter_mut().zip(&other.tiles) {
             let Some(theirs) = theirs else { continue };
             let Some(mine) = mine else {
@@ -172,8 +209,9 @@ impl FilmPart {
 
     fn sums(&self, x: u32, y: u32) -> &Sums {
         const NONE: Sums = [[0; 3]; 2];
-        match &self.tiles[(y / TILE * self.size[0].div_ceil(TILE) + x / TILE) as usize] {
-            Some(tile) => &tile.0[(y % TILE * TILE + x % TILE) as usize],
+        let (tile, at) = self.place_at(x, y);
+        match &self.tiles[tile] {
+            Some(tile) => &tile.0[at],
             None => &NONE,
         }
     }

@@ -1,6 +1,19 @@
 //! From sums to a picture and its error.
 
 use super::{FilmPart, Sums};
+use crate::aov::Aov;
+
+/// 2^-64.
+const UNIT: f64 = 1.0 / 18_446_744_073_709_551_616.0;
+
+/// A channel of a picture, beside its light.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Channel {
+    /// `LAYER.NAME`.
+    pub name: &'static str,
+    /// Row by row, width * height values.
+    pub values: Vec<f32>,
+}
 
 impl FilmPart {
     /// The picture after `samples` samples per pixel (at least 1): sum / samples, exact, rounded once to the nearest float. Row by row, width *
@@ -42,28 +55,60 @@ impl FilmPart {
         }
         Some(out)
     }
+
+    /// The channels of its AOVs after `samples` samples per pixel (at least 1), in the order of [`Aov::ALL`]; see there what they mean. `offset`
+    /// is what was taken from the scene's coordinates to recentre them: positions get it back, in f64, before they are rounded.
+    pub fn channels(&self, samples: u32, offset: [f64; 3]) -> Vec<Channel> {
+        let mut out = Vec::new();
+        for aov in self.aovs().iter() {
+            let first = out.len();
+            let pixels = self.size[0] as usize * self.size[1] as usize;
+            out.extend(aov.channels().iter().map(|name| Channel { name, values: Vec::with_capacity(pixels) }));
+            for y in 0..self.size[1] {
+                for x in 0..self.size[0] {
+                    let sums = self.planes.sums(aov, self.place_at(x, y));
+                    for (c, channel) in out[first..].iter_mut().enumerate() {
+                        channel.values.push(match (aov, sums) {
+                            (Aov::Variance, _) => {
+                                variance(self.sums(x, y), c, samples).map_or(f32::INFINITY, |v| v as f32)
+                            }
+                            (_, None) => 0.0,
+                            (Aov::ObjectId | Aov::MaterialId, Some(sums)) => quotient(sums[c], 1),
+                            (Aov::Position, Some(sums)) => {
+                                let (sum, times) = (sums[c] as f64 * UNIT, sums[3] as f64 * UNIT);
+                                ((sum + offset[c] * times) / f64::from(samples)) as f32
+                            }
+                            (_, Some(sums)) => quotient(sums[c], samples),
+                        });
+                    }
+                }
+            }
+        }
+        out
+    }
 }
 
-/// Sum over the channels of Var / (M^2 + 0.01).
-fn pixel_error(sums: &Sums, samples: u32) -> Option<f64> {
+/// Estimated variance of a channel's mean, as in [`FilmPart::rel_mse`].
+fn variance([a, b]: &Sums, c: usize, samples: u32) -> Option<f64> {
     if samples < 2 {
         return None;
     }
     let n = f64::from(samples);
     let n_b = f64::from(samples / 2);
     let n_a = n - n_b;
-    const UNIT: f64 = 1.0 / 18_446_744_073_709_551_616.0; // 2^-64
+    let difference = a[c] as f64 * UNIT / n_a - b[c] as f64 * UNIT / n_b;
+    Some(difference * difference * (n_a * n_b / (n * n)))
+}
+
+/// Sum over the channels of Var / (M^2 + 0.01).
+fn pixel_error(sums: &Sums, samples: u32) -> Option<f64> {
     let [a, b] = sums;
-    Some(
-        (0..3)
-            .map(|c| {
-                let (a, b) = (a[c] as f64 * UNIT, b[c] as f64 * UNIT);
-                let mean = (a + b) / n;
-                let difference = a / n_a - b / n_b;
-                difference * difference * (n_a * n_b / (n * n)) / (mean * mean + 0.01)
-            })
-            .sum(),
-    )
+    let mut error = 0.0;
+    for c in 0..3 {
+        let mean = (a[c] as f64 * UNIT + b[c] as f64 * UNIT) / f64::from(samples);
+        error += variance(sums, c, samples)? / (mean * mean + 0.01);
+    }
+    Some(error)
 }
 
 /// `sum 2^-64 / n`, rounded once to the nearest float, ties to even.

@@ -4,6 +4,7 @@
 //! throughput, and splitting at the first hit. What a ray becomes is a function of (frame, world, ray, hit) alone: neither the batch it is
 //! in nor its neighbours matter.
 
+mod aov;
 mod block;
 mod diffuse;
 mod interaction;
@@ -26,6 +27,7 @@ use crate::skip::{Skip, SkipCounts, Skips};
 use crate::texture::{NoTextures, Textures};
 use crate::world::{Primitive, World};
 
+pub use aov::take_aovs;
 pub use primary::camera_rays;
 pub use shade::{shade, shade_traced};
 

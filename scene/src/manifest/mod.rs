@@ -6,6 +6,7 @@ pub(crate) mod tests;
 
 use std::collections::BTreeSet;
 
+use rayherd_render::aov::Aovs;
 use rayherd_render::filter::Filter;
 use rayherd_render::ray::PrimId;
 use serde::{Deserialize, Serialize};
@@ -18,7 +19,7 @@ use crate::prepare::PrepareSettings;
 
 /// Version of the manifest and of everything it names. A change of any layout, of recentring, of the order of records
 /// or of the grid's rules changes it; scenes of other versions are prepared again.
-pub const FORMAT: u32 = 4;
+pub const FORMAT: u32 = 5;
 
 /// A prepared scene. Its bytes are canonical ([`Manifest::encode`]); its name is their hash.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -124,6 +125,9 @@ pub struct Defaults {
     pub rr_depth: Option<u32>,
     /// As in [`Description::hide_emitters`].
     pub hide_emitters: bool,
+    /// As in [`Description::aovs`].
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub aovs: Option<Aovs>,
     /// Stand-ins that were made on request.
     pub substitutions: Vec<Substitution>,
 }
@@ -139,6 +143,7 @@ impl Defaults {
             max_depth: description.max_depth,
             rr_depth: description.rr_depth,
             hide_emitters: description.hide_emitters,
+            aovs: description.aovs,
             substitutions: description.substitutions.clone(),
         }
     }

@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use rayherd_render::attributes::AttributeBlock;
+use rayherd_render::attributes::{AttributeBlock, NO_UV};
 use rayherd_render::bvh::{Fork, build_block};
 
 use super::PrepareError;
@@ -79,25 +79,25 @@ fn attributes(records: &Records) -> AttributeBlock {
         records.extras.iter().map(|e| e.shape).chain(records.spheres.iter().map(|s| s.shape)).collect();
     let mut block = AttributeBlock { shapes, ..AttributeBlock::default() };
     if !records.normals.is_empty() {
-        block.normals = spread(records, &records.normals, NORMALS);
+        block.normals = spread(records, &records.normals, NORMALS, Default::default());
     }
     if !records.uvs.is_empty() {
-        block.uvs = spread(records, &records.uvs, UVS);
+        block.uvs = spread(records, &records.uvs, UVS, NO_UV);
     }
     if !records.attributes.is_empty() {
-        block.attributes = spread(records, &records.attributes, ATTRIBUTES);
+        block.attributes = spread(records, &records.attributes, ATTRIBUTES, Default::default());
     }
     block
 }
 
-/// One value per primitive from those of the triangles that have one; zeros for the others.
-fn spread<T: Copy + Default>(records: &Records, values: &[[T; 3]], flag: u32) -> Vec<[T; 3]> {
+/// One value per primitive from those of the triangles that have one; `none` for the others.
+fn spread<T: Copy>(records: &Records, values: &[[T; 3]], flag: u32, none: [T; 3]) -> Vec<[T; 3]> {
     let mut values = values.iter();
     let mut out = Vec::with_capacity(records.len());
     for extra in &records.extras {
         let value = if extra.has & flag != 0 { values.next().copied() } else { None };
-        out.push(value.unwrap_or_default());
+        out.push(value.unwrap_or(none));
     }
-    out.resize(records.len(), [T::default(); 3]);
+    out.resize(records.len(), none);
     out
 }

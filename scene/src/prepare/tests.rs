@@ -346,7 +346,7 @@ fn attributes_and_lights_stay_with_their_primitives() {
             };
             assert_eq!(attributes.shapes[i], shape);
             assert_eq!(attributes.normals.get(i).copied().unwrap_or_default(), n.unwrap_or_default());
-            assert_eq!(attributes.uvs.get(i).copied().unwrap_or_default(), uv.unwrap_or_default());
+            assert_eq!(attributes.uv(i), uv);
         }
     }
     let world: World = serde_json::from_slice(&store.get(&manifest.world).unwrap()).unwrap();
