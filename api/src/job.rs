@@ -8,7 +8,7 @@ use std::collections::BTreeMap;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-use crate::{ByteSize, ImageSize, Strategy};
+use crate::{Aov, ByteSize, ImageSize, Strategy};
 
 /// The group and version of [`RenderJob`].
 pub const API_VERSION: &str = "rayherd.io/v1alpha1";
@@ -201,6 +201,9 @@ pub struct ImageSpec {
     /// The EXR file; the PNG stands beside it. With several cameras `-NAME` or `-0001`.. comes before the extension.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub output: Option<String>,
+    /// Layers of the EXR beside the picture; those that the scene asks for by default, and an empty list is none.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub aovs: Option<Vec<Aov>>,
     /// Exposure of the PNG in stops; 0 by default. The EXR is not changed by it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[schemars(range(min = -32.0, max = 32.0))]

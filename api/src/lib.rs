@@ -4,6 +4,7 @@
 //! ([`schemars`]) and are checked by one pure function, [`validate()`]. Numbers are `i64`, `i32` or `f64` with ranges,
 //! because an OpenAPI schema knows no unsigned types.
 
+pub mod aov;
 pub mod byte_size;
 pub mod image_size;
 pub mod job;
@@ -12,6 +13,7 @@ pub mod resource;
 pub mod strategy;
 pub mod validate;
 
+pub use aov::{Aov, AovList};
 pub use byte_size::ByteSize;
 pub use image_size::ImageSize;
 pub use job::{

@@ -27,6 +27,7 @@ ROWS = [
     ("walk", CHEST, ["cpu_s"]),
     ("sky", CORNELL, ["cpu_s"]),
     ("textures", STAIRCASE, ["trace:read:texture"]),
+    ("aovs", CORNELL, ["cpu_s"]),
     ("lobes", STAIRCASE, ["cpu_s"]),
     ("details", STAIRCASE, ["cpu_s"]),
     ("shadows", CORNELL, ["rays.shadow"]),

@@ -4,6 +4,7 @@ use std::path::{Path, PathBuf};
 
 use rayherd_api::{CameraSpec, RenderJob};
 use rayherd_herd::job::spec;
+use rayherd_render::film::Layout;
 use rayherd_render::frame::Frame;
 use rayherd_scene::manifest::Manifest;
 
@@ -64,15 +65,18 @@ pub fn check_files(files: &[PathBuf]) -> Result<(), Mistake> {
 /// The frame that a camera sees; the scene's own without one.
 pub fn frame(job: &RenderJob, manifest: &Manifest, camera: Option<&CameraSpec>) -> anyhow::Result<Frame> {
     let frame = spec::frame(&job.spec, manifest, camera)?;
-    check_memory(frame.size)?;
+    check_memory(frame.layout())?;
     Ok(frame)
 }
 
 /// Bytes per pixel: the film's two halves of three 16-byte sums, once for the whole and once in tasks, and the picture.
 const BYTES_PER_PIXEL: u64 = 2 * 96 + 12;
 
-fn check_memory([width, height]: [u32; 2]) -> Result<(), Mistake> {
-    let needed = u64::from(width) * u64::from(height) * BYTES_PER_PIXEL;
+fn check_memory(layout: impl Into<Layout>) -> Result<(), Mistake> {
+    let Layout { size: [width, height], aovs } = layout.into();
+    // their sums likewise, and their channels
+    let of_aovs = aovs.iter().map(|a| 2 * 16 * a.sums() + 4 * a.channels().len()).sum::<usize>() as u64;
+    let needed = u64::from(width) * u64::from(height) * (BYTES_PER_PIXEL + of_aovs);
     let Some(have) = memory_of_machine() else { return Ok(()) };
     if needed > have {
         let gib = |bytes: u64| bytes as f64 / f64::from(1 << 30);

@@ -1,7 +1,7 @@
 //! Flags that say which image is wanted.
 
 use clap::Args;
-use rayherd_api::{CameraSpec, ImageSize, RenderJobSpec};
+use rayherd_api::{AovList, CameraSpec, ImageSize, RenderJobSpec};
 use rayherd_scene::import::CameraView;
 
 use crate::options::set;
@@ -16,6 +16,10 @@ pub struct ImageOptions {
     /// Where to look from, ten numbers: ORIGIN,TARGET,UP,FOV (three each; FOV in degrees along the width); repeatable
     #[arg(long, value_name = "CAMERA", allow_hyphen_values = true)]
     pub camera: Vec<CameraView>,
+    /// Layers of the EXR beside the picture, names between commas, or all, or none: albedo, normal, depth, position, uv, objectId,
+    /// materialId, variance, cost [default: those that the scene asks for]
+    #[arg(long, value_name = "NAMES")]
+    pub aov: Option<AovList>,
     /// Seed of every random number [default: 0]
     #[arg(long, value_name = "N", allow_hyphen_values = true)]
     pub seed: Option<i64>,
@@ -37,6 +41,7 @@ impl ImageOptions {
         if !self.camera.is_empty() {
             spec.image.cameras = self.camera.iter().map(camera_spec).collect();
         }
+        set(&mut spec.image.aovs, self.aov.as_ref().map(|list| list.0.clone()));
         set(&mut spec.sampling.seed, self.seed);
         set(&mut spec.sampling.max_depth, self.max_depth);
         set(&mut spec.sampling.rr_depth, self.rr_depth);

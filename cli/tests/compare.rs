@@ -84,3 +84,36 @@ fn what_cannot_be_compared() {
     assert_mistake(&rayherd(folder.path(), &["compare", "a.exr", "a.exr", "--max-rmse", "-1"]), &["--max-rmse"]);
     assert_mistake(&rayherd(folder.path(), &["compare", "a.exr", "a.exr", "--diff", "no/d.png"]), &["no/d.png"]);
 }
+
+/// Layers count for what is identical, and not for the figures of the picture.
+#[test]
+fn layers_beside_the_picture() {
+    use exr::prelude::{AnyChannel, AnyChannels, Encoding, FlatSamples, Image, Layer, LayerAttributes, WritableImage};
+    let folder = tempfile::tempdir().unwrap();
+    let write = |name: &str, layers: &[(&str, f32)]| {
+        let all = [("R", 0.5), ("G", 0.25), ("B", 0.75)].iter().chain(layers);
+        let list = all.map(|&(name, x)| AnyChannel::new(name, FlatSamples::F32(vec![x; 32])));
+        let channels = AnyChannels::sort(list.collect());
+        let layer = Layer::new((8, 4), LayerAttributes::default(), Encoding::SMALL_LOSSLESS, channels);
+        Image::from_layer(layer).write().to_file(folder.path().join(name)).unwrap();
+    };
+    write("a.exr", &[("depth.Z", 3.0), ("uv.U", 0.5)]);
+    write("b.exr", &[("depth.Z", 4.0), ("uv.U", 0.5)]);
+    write("c.exr", &[("depth.Z", 3.0)]);
+    write("d.exr", &[]);
+    let compare = |other: &str| {
+        let run = rayherd(folder.path(), &["compare", "a.exr", other]);
+        (run.code, serde_json::from_str::<Value>(&run.out).unwrap_or_else(|e| panic!("{e}: {}", run.err)))
+    };
+    assert_eq!(compare("a.exr").0, 0);
+    let (code, other) = compare("b.exr");
+    assert_eq!((code, &other["identical"], &other["rmse"]), (1, &Value::from(false), &Value::from(0.0)));
+    assert_eq!(other["channels"]["depth.Z"]["max_abs_diff"], 1.0);
+    assert!(other["mean_ratio"].get("depth.Z").is_none() && other.get("only_in_a").is_none());
+    let (code, other) = compare("c.exr");
+    assert_eq!((code, &other["only_in_a"]), (1, &Value::from(vec!["uv.U"])));
+    let (code, other) = compare("d.exr");
+    assert_eq!((code, &other["only_in_a"]), (1, &Value::from(vec!["depth.Z", "uv.U"])));
+    let accepted = rayherd(folder.path(), &["compare", "d.exr", "b.exr", "--max-abs-diff", "0"]);
+    assert_eq!(accepted.code, 0, "{}", accepted.err);
+}

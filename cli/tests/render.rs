@@ -268,3 +268,114 @@ fn mistakes_are_found_before_anything_is_rendered() {
     assert_mistake(&rayherd(folder.path(), &huge), &["65535x65535", "GiB", "--size"]);
     assert_eq!(files(folder.path()), [""; 0]);
 }
+
+/// Channels of an EXR file by name.
+fn channels(path: &Path) -> Vec<(String, Vec<f32>)> {
+    use exr::prelude::{FlatSamples, ReadChannels, ReadLayers};
+    let reader = exr::prelude::read().no_deep_data().largest_resolution_level().all_channels().first_valid_layer();
+    let image = reader.all_attributes().from_file(path).unwrap();
+    let list = image.layer_data.channel_data.list.into_iter();
+    list.map(|c| match c.sample_data {
+        FlatSamples::F32(values) => (c.name.to_string(), values),
+        other => panic!("{other:?}"),
+    })
+    .collect()
+}
+
+#[test]
+fn aovs_are_layers_of_the_same_file() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = |name: &str| folder.path().join(name);
+    let run = |name: &str, more: &[&str]| {
+        let run = cornell(folder.path(), name, more);
+        assert_eq!(run.code, 0, "{more:?}: {}", run.err);
+        fs::read(at(name)).unwrap()
+    };
+    let plain = run("plain.exr", &[]);
+    assert!(run("none.exr", &["--aov", "none"]) == plain);
+    let some = run("some.exr", &["--aov", "normal,depth,albedo"]);
+    for more in [
+        &["--threads", "2", "--aov", "albedo,normal,depth"][..],
+        &["--splits", "5", "--strategy", "demand-driven", "--nodes", "2", "--aov", "depth,albedo,normal"],
+        &["--splits", "3", "--strategy", "scheduling-grid", "--slots", "1,2", "--aov", "normal,depth,albedo"],
+    ] {
+        assert!(run("other.exr", more) == some, "{more:?}");
+    }
+    let names = |file: &str| channels(&at(file)).into_iter().map(|c| c.0).collect::<Vec<_>>();
+    assert_eq!(names("plain.exr"), ["B", "G", "R"]);
+    let expected = ["B", "G", "R", "albedo.B", "albedo.G", "albedo.R", "depth.Z", "normal.X", "normal.Y", "normal.Z"];
+    assert_eq!(names("some.exr"), expected);
+    // the picture is the same, and so is the PNG
+    let (with, without) = (channels(&at("some.exr")), channels(&at("plain.exr")));
+    assert_eq!(with[..3], without[..]);
+    assert_eq!(fs::read(at("some.png")).unwrap(), fs::read(at("plain.png")).unwrap());
+    // the camera looks from z = 3.9 at the back wall, at z = -1
+    let value = |name: &str, pixel: usize| with.iter().find(|c| c.0 == name).unwrap().1[pixel];
+    let back = 16 * 4 + 8;
+    assert!(value("depth.Z", back) > 4.9 && value("depth.Z", back) < 5.0, "{}", value("depth.Z", back));
+    assert!((value("normal.Z", back) - 1.0).abs() < 1e-6);
+    run("all.exr", &["--aov", "all"]);
+    assert_eq!(names("all.exr").len(), 3 + 18);
+    assert_mistake(&cornell(folder.path(), "x.exr", &["--aov", "depth,colour"]), &["--aov", "\"colour\"", "albedo"]);
+}
+
+/// A job's file and Mitsuba's `aov` integrator ask for them too; a flag wins.
+#[test]
+fn aovs_of_job_files_and_scenes() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = |name: &str| folder.path().join(name);
+    let example = fs::read_to_string(repository("examples/cornell-box.xml")).unwrap();
+    let begin = example.find("<integrator").unwrap();
+    let end = begin + example[begin..].find("</integrator>").unwrap() + "</integrator>".len();
+    let around = |aovs: &str| {
+        let outer = format!("<integrator type=\"aov\"><string name=\"aovs\" value=\"{aovs}\"/>");
+        format!("{}{outer}{}</integrator>{}", &example[..begin], &example[begin..end], &example[end..])
+    };
+    fs::write(at("plain.xml"), &example).unwrap();
+    fs::write(at("aov.xml"), around("dd.y:depth, nn:sh_normal")).unwrap();
+    let job = "apiVersion: rayherd.io/v1alpha1
+kind: RenderJob
+spec:
+  scene: {source: plain.xml}
+  image: {size: 8x8, output: job.exr, aovs: [normal, depth]}
+  sampling: {spp: 2}
+";
+    fs::write(at("job.yaml"), job).unwrap();
+    let run = |arguments: &[&str]| {
+        let run = rayherd(folder.path(), arguments);
+        assert_eq!(run.code, 0, "{arguments:?}: {}", run.err);
+    };
+    run(&["render", "-f", "job.yaml"]);
+    run(&["render", "aov.xml", "--size", "8x8", "--spp", "2", "-o", "scene.exr"]);
+    run(&["render", "aov.xml", "--size", "8x8", "--spp", "2", "--aov", "none", "-o", "flag.exr"]);
+    run(&["render", "plain.xml", "--size", "8x8", "--spp", "2", "-o", "plain.exr"]);
+    let (of_job, of_scene) = (channels(&at("job.exr")), channels(&at("scene.exr")));
+    assert_eq!(of_job.len(), 7);
+    assert!(of_job == of_scene);
+    assert!(channels(&at("flag.exr")) == channels(&at("plain.exr")));
+    fs::write(at("bad.yaml"), job.replace("[normal, depth]", "[normal, depths]")).unwrap();
+    assert_mistake(&rayherd(folder.path(), &["render", "-f", "bad.yaml"]), &["bad.yaml", "depths", "materialId"]);
+    fs::write(at("bad.xml"), around("a:dp_du,b:depth")).unwrap();
+    assert_mistake(&rayherd(folder.path(), &["render", "bad.xml"]), &["bad.xml:", "AOV \"dp_du\""]);
+    fs::write(at("bad.xml"), around("depth")).unwrap();
+    assert_mistake(&rayherd(folder.path(), &["render", "bad.xml"]), &["\"depth\" should be NAME:KIND"]);
+}
+
+/// They go on with more samples, and are another picture than one with others.
+#[test]
+fn aovs_are_resumed() {
+    let folder = tempfile::tempdir().unwrap();
+    let run = |output: &str, more: &[&str]| {
+        let scene = repository("examples/cornell-box.xml");
+        let start = ["render", scene.to_str().unwrap(), "--size", "16x16", "-o", output];
+        rayherd(folder.path(), &[&start[..], more].concat())
+    };
+    let fine = |run: Run| assert_eq!(run.code, 0, "{}", run.err);
+    fine(run("long.exr", &["--spp", "9", "--aov", "all"]));
+    fine(run("short.exr", &["--spp", "3", "--aov", "all", "--store", "s"]));
+    fine(run("more.exr", &["--spp", "9", "--aov", "all", "--store", "s", "--resume"]));
+    let read = |name: &str| fs::read(folder.path().join(name)).unwrap();
+    assert!(read("long.exr") == read("more.exr") && read("long.exr") != read("short.exr"));
+    let other = run("other.exr", &["--spp", "9", "--aov", "depth", "--store", "s", "--resume"]);
+    assert_mistake(&other, &["aovs", "differs"]);
+}

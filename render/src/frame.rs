@@ -2,7 +2,9 @@
 
 use serde::{Deserialize, Serialize};
 
+use crate::aov::Aovs;
 use crate::camera::Camera;
+use crate::film::Layout;
 use crate::filter::Filter;
 use crate::sampler::MAX_SPLIT;
 
@@ -26,6 +28,13 @@ pub struct Frame {
     /// Camera rays pass through what emits light, and see no sky (Mitsuba's `hide_emitters`).
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub hide_emitters: bool,
+    /// What is taken beside light.
+    #[serde(default, skip_serializing_if = "none")]
+    pub aovs: Aovs,
+}
+
+fn none(aovs: &Aovs) -> bool {
+    aovs.is_empty()
 }
 
 /// Why a frame cannot be rendered.
@@ -46,6 +55,11 @@ pub enum FrameError {
 }
 
 impl Frame {
+    /// What its film holds.
+    pub fn layout(&self) -> Layout {
+        Layout { size: self.size, aovs: self.aovs }
+    }
+
     /// Checks the ranges that the rest of the crate relies on.
     pub fn check(&self) -> Result<(), FrameError> {
         let [w, h] = self.size;

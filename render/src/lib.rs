@@ -13,6 +13,7 @@
     allow(clippy::useless_conversion, clippy::unnecessary_cast, dead_code, unused_imports, unused_qualifications)
 )]
 
+pub mod aov;
 pub mod attributes;
 pub mod bvh;
 pub mod camera;

@@ -42,6 +42,8 @@ pub enum Skip {
     Merged,
     /// Paths worth little are ended by Russian roulette. Counted: paths.
     Roulette,
+    /// AOVs that nobody asked for are not found. Counted: rays of batches that met something.
+    Aovs,
     /// Film tiles that no light reached are neither held nor stored. Counted: tiles, once for each task.
     Film,
     /// What is prepared is not prepared again. Counted: objects.
@@ -62,7 +64,7 @@ fn names() -> String {
 
 impl Skip {
     /// All of them.
-    pub const ALL: [Skip; 16] = [
+    pub const ALL: [Skip; 17] = [
         Skip::Cells,
         Skip::Beaten,
         Skip::Walk,
@@ -76,6 +78,7 @@ impl Skip {
         Skip::Sky,
         Skip::Merged,
         Skip::Roulette,
+        Skip::Aovs,
         Skip::Film,
         Skip::Prepared,
         Skip::Volume,
@@ -97,6 +100,7 @@ impl Skip {
             Skip::Sky => "sky",
             Skip::Merged => "merged",
             Skip::Roulette => "roulette",
+            Skip::Aovs => "aovs",
             Skip::Film => "film",
             Skip::Prepared => "prepared",
             Skip::Volume => "volume",

@@ -2,6 +2,7 @@
 
 use std::path::PathBuf;
 
+use rayherd_render::aov::Aovs;
 pub use rayherd_render::camera::Projection;
 pub use rayherd_render::filter::Filter;
 pub use rayherd_render::material::{
@@ -340,6 +341,9 @@ pub struct Description {
     pub rr_depth: Option<u32>,
     /// The camera sees neither what emits light nor the sky; both are seen in reflections.
     pub hide_emitters: bool,
+    /// What is to be taken beside light, if the source says it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub aovs: Option<Aovs>,
     /// What was replaced by a stand-in on request, for log and report.
     pub substitutions: Vec<Substitution>,
     /// What was passed over because it says nothing that is computed here, or was read in a way that is not the only one.

@@ -3,6 +3,7 @@
 use rayherd_api::Strategy;
 use rayherd_herd::job::{JobSettings, NodeSpec, PreparedScene, Sampling, Silent};
 use rayherd_herd::local::render_local;
+use rayherd_render::aov::Aovs;
 use rayherd_render::bvh::Kernel;
 use rayherd_render::camera::Camera;
 use rayherd_render::film::FilmPart;
@@ -35,8 +36,17 @@ fn film(scene: &PreparedScene, scale: f32, settings: &JobSettings) -> FilmPart {
     let to_world = [[-1.0, 0.0, 0.0, 0.1 * s], [0.0, 1.0, 0.0, 0.2 * s], [0.0, 0.0, -1.0, 2.5 * s]];
     let size = [12, 12];
     let camera = Camera::new(&to_world, 60.0, size, scene.manifest.offset).expect("a camera");
-    let frame =
-        Frame { camera, size, filter: Filter::Box, seed: 5, max_depth: 5, rr_depth: 3, split: 2, hide_emitters: false };
+    let frame = Frame {
+        camera,
+        size,
+        filter: Filter::Box,
+        seed: 5,
+        max_depth: 5,
+        rr_depth: 3,
+        split: 2,
+        hide_emitters: false,
+        aovs: Aovs::NONE,
+    };
     let sampling = Sampling { spp: 8, target_error: None, time_limit: None };
     let outcome = render_local(scene, &frame, &sampling, settings, &Silent).expect("a picture");
     assert_eq!(outcome.film.rejected().count, 0);

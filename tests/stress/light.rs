@@ -6,6 +6,7 @@ use std::time::Instant;
 use glam::Vec3;
 use rayherd_herd::job::{JobSettings, PreparedScene, Sampling, Silent};
 use rayherd_herd::local::render_local;
+use rayherd_render::aov::Aovs;
 use rayherd_render::camera::Camera;
 use rayherd_render::film::FilmPart;
 use rayherd_render::filter::Filter;
@@ -41,7 +42,17 @@ fn taken(description: &Description, shot: &Shot) -> FilmPart {
     let scene = PreparedScene::open(manifest, objects).expect("a sound scene");
     let camera = Camera::new(&shot.to_world, shot.fov, shot.size, scene.manifest.offset).expect("a camera");
     let Shot { size, filter, max_depth, spp, .. } = *shot;
-    let frame = Frame { camera, size, filter, seed: 3, max_depth, rr_depth: 1000, split: 1, hide_emitters: false };
+    let frame = Frame {
+        camera,
+        size,
+        filter,
+        seed: 3,
+        max_depth,
+        rr_depth: 1000,
+        split: 1,
+        hide_emitters: false,
+        aovs: Aovs::NONE,
+    };
     let sampling = Sampling { spp, target_error: None, time_limit: None };
     render_local(&scene, &frame, &sampling, &JobSettings::default(), &Silent).expect("a picture").film
 }

@@ -25,6 +25,9 @@ use crate::output::{distinct, png_file, replace};
 ///   relmse          mean of (A - B)^2 / (B^2 + 0.01)
 ///   mean_ratio      mean of A / mean of B, per channel
 ///   channels        the same by channel
+/// Layers beside the picture (AOVs) count for identical and channels; the other
+/// figures, and what is accepted, are those of the picture. Layers that only one
+/// of the two has are listed in only_in_a and only_in_b.
 /// A figure that is not finite is null.
 #[derive(Args)]
 #[command(
@@ -89,6 +92,10 @@ struct Comparison {
     measures: Measures,
     mean_ratio: BTreeMap<String, f64>,
     channels: BTreeMap<String, Measures>,
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    only_in_a: Vec<String>,
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    only_in_b: Vec<String>,
 }
 
 #[derive(Clone, Copy, Serialize)]
@@ -99,20 +106,34 @@ struct Measures {
 }
 
 impl Comparison {
-    /// Both have the same channels and sizes.
+    /// Both have the same sizes, and the same channels but for layers beside the picture.
     fn of(a: &Channels, b: &Channels, file_identical: bool) -> Self {
-        let pairs = || a.values.iter().zip(b.values.values());
+        let only = |one: &Channels, other: &Channels| {
+            one.values.keys().filter(|name| !other.values.contains_key(*name)).cloned().collect::<Vec<_>>()
+        };
+        let (only_in_a, only_in_b) = (only(a, b), only(b, a));
+        let pairs = || a.values.iter().filter_map(|(name, a)| Some((name, a, b.values.get(name)?)));
+        let picture = picture_channels(a);
+        let of_picture = || pairs().filter(|(name, ..)| picture.contains(name));
         let same = |a: &[f32], b: &[f32]| a.iter().zip(b).all(|(a, b)| a.to_bits() == b.to_bits());
         Comparison {
-            identical: pairs().all(|((_, a), b)| same(a, b)),
+            identical: only_in_a.is_empty() && only_in_b.is_empty() && pairs().all(|(_, a, b)| same(a, b)),
             file_identical,
             width: a.width,
             height: a.height,
-            measures: Measures::of(pairs().flat_map(|((_, a), b)| a.iter().zip(b))),
-            mean_ratio: pairs().map(|((name, a), b)| (name.clone(), mean(a) / mean(b))).collect(),
-            channels: pairs().map(|((name, a), b)| (name.clone(), Measures::of(a.iter().zip(b)))).collect(),
+            measures: Measures::of(of_picture().flat_map(|(_, a, b)| a.iter().zip(b))),
+            mean_ratio: of_picture().map(|(name, a, b)| (name.clone(), mean(a) / mean(b))).collect(),
+            channels: pairs().map(|(name, a, b)| (name.clone(), Measures::of(a.iter().zip(b)))).collect(),
+            only_in_a,
+            only_in_b,
         }
     }
+}
+
+/// Channels that are the picture: those of no layer, or all where each is of one.
+fn picture_channels(channels: &Channels) -> Vec<&String> {
+    let plain: Vec<&String> = channels.values.keys().filter(|name| !name.contains('.')).collect();
+    if plain.is_empty() { channels.values.keys().collect() } else { plain }
 }
 
 impl Measures {
@@ -158,7 +179,7 @@ fn check_same_shape(a: &Channels, b: &Channels, arguments: &Arguments) -> Result
         let sizes = format!("{a_path} is {}x{} but {b_path} is {}x{}", a.width, a.height, b.width, b.height);
         return Err(Mistake(format!("{sizes}: render both at one size")));
     }
-    if !a.values.keys().eq(b.values.keys()) {
+    if picture_channels(a) != picture_channels(b) {
         let names = |c: &Channels| c.values.keys().cloned().collect::<Vec<_>>().join(", ");
         let channels = format!("{a_path} has channels {} but {b_path} has {}", names(a), names(b));
         return Err(Mistake(format!("{channels}: only pictures with the same channels can be compared")));

@@ -261,7 +261,8 @@ fn save(scene: &PreparedScene, shot: &Shot, outcome: &JobOutcome, exposure: f64)
         // the frame says nothing of it
         definition.insert("no_skip".to_owned(), json!([Skip::Lights.name()]));
     }
-    replace::replace_or_keep(&shot.exr, &picture::encode(&outcome.image, &definition)?)?;
+    let channels = outcome.film.channels(outcome.spp, scene.manifest.offset);
+    replace::replace_or_keep(&shot.exr, &picture::encode(&outcome.image, &channels, &definition)?)?;
     replace::replace_or_keep(&shot.png(), &png_file::encode(&outcome.image, exposure)?)
 }
 

@@ -131,9 +131,9 @@ mod tests {
 
     #[test]
     fn the_same_picture_is_the_same_bytes_and_comes_back() {
-        let bytes = encode(&picture(), &definition()).unwrap();
+        let bytes = encode(&picture(), &[], &definition()).unwrap();
         for _ in 0..4 {
-            assert_eq!(encode(&picture(), &definition()).unwrap(), bytes);
+            assert_eq!(encode(&picture(), &[], &definition()).unwrap(), bytes);
         }
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("a.exr");
@@ -154,7 +154,7 @@ mod tests {
     fn damaged_files_are_errors() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("a.exr");
-        let good = encode(&picture(), &definition()).unwrap();
+        let good = encode(&picture(), &[], &definition()).unwrap();
         for bad in [&good[..0], &good[..40], &good[..good.len() / 2], &b"no picture at all"[..]] {
             fs::write(&path, bad).unwrap();
             let error = read(&path).err().unwrap().to_string();
@@ -172,7 +172,7 @@ mod tests {
 
     #[test]
     fn memory_is_asked_before_it_is_taken() {
-        let bytes = encode(&picture(), &definition()).unwrap();
+        let bytes = encode(&picture(), &[], &definition()).unwrap();
         let pixels = 70 * 40 * 3 * 4;
         assert!(decode(&bytes, pixels).is_ok());
         let error = decode(&bytes, pixels - 1).err().unwrap();
@@ -185,7 +185,7 @@ mod tests {
             AnyChannel, AnyChannels, Blocks, Compression, Encoding, Image, Layer, LayerAttributes, LineOrder, Vec2,
             WritableImage, f16,
         };
-        let mut made = vec![encode(&picture(), &definition()).unwrap()];
+        let mut made = vec![encode(&picture(), &[], &definition()).unwrap()];
         let encodings = [
             (Compression::Uncompressed, Blocks::ScanLines),
             (Compression::RLE, Blocks::Tiles(Vec2(16, 16))),

@@ -1,7 +1,8 @@
 //! From the spec of a checked job to what importing, preparing and tracing are told: the same for a local run and for a
 //! cluster, so that both make the same bytes.
 
-use rayherd_api::{CameraSpec, LightSpec, RenderJobSpec, Strategy};
+use rayherd_api::{self as api, CameraSpec, LightSpec, RenderJobSpec, Strategy};
+use rayherd_render::aov::{Aov, Aovs};
 use rayherd_render::camera::{Camera, View};
 use rayherd_render::filter::Filter;
 use rayherd_render::frame::Frame;
@@ -104,9 +105,27 @@ pub fn frame(spec: &RenderJobSpec, manifest: &Manifest, camera: Option<&CameraSp
         rr_depth: given(sampling.rr_depth).or(defaults.rr_depth).unwrap_or(DEFAULT_RR_DEPTH),
         split: given(sampling.split).unwrap_or(1),
         hide_emitters: defaults.hide_emitters,
+        aovs: match &image.aovs {
+            Some(aovs) => aovs.iter().map(aov).collect(),
+            None => defaults.aovs.unwrap_or(Aovs::NONE),
+        },
     };
     frame.check()?;
     Ok(frame)
+}
+
+fn aov(aov: &api::Aov) -> Aov {
+    match aov {
+        api::Aov::Albedo => Aov::Albedo,
+        api::Aov::Normal => Aov::Normal,
+        api::Aov::Depth => Aov::Depth,
+        api::Aov::Position => Aov::Position,
+        api::Aov::Uv => Aov::Uv,
+        api::Aov::ObjectId => Aov::ObjectId,
+        api::Aov::MaterialId => Aov::MaterialId,
+        api::Aov::Variance => Aov::Variance,
+        api::Aov::Cost => Aov::Cost,
+    }
 }
 
 /// What defines an image, for the header of its file: the scene's content, the frame, the number of samples.

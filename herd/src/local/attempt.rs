@@ -3,7 +3,8 @@
 use std::cell::OnceCell;
 use std::collections::BTreeMap;
 
-use rayherd_render::film::{BoundedFilm, FilmPart};
+use rayherd_render::aov::Aovs;
+use rayherd_render::film::{BoundedFilm, FilmPart, Layout};
 use rayherd_render::frame::Frame;
 use rayherd_render::path::{Context, PathRay};
 use rayherd_render::skip::{Skip, SkipCounts};
@@ -80,7 +81,7 @@ pub enum FilmUse {
     Banded {
         /// Tiles of a band.
         band: u32,
-        /// Most tiles that the task holds as sums.
+        /// The task holds as sums the memory of so many tiles of light at most.
         most: usize,
     },
 }
@@ -121,8 +122,9 @@ pub fn run(shared: &Shared, attempt: &Attempt, stop: &dyn Stop) -> Result<Made, 
     let sink = Store { shared, attempt };
     let mut groups = Groups::new(&sink, shared.settings.ray_buffer);
     let skips = shared.scene.skips();
+    let aovs = if skips.makes(Skip::Aovs) { shared.frame.aovs } else { Aovs::ALL };
     let mut film = BoundedFilm::new(
-        shared.frame.size,
+        Layout { aovs, ..shared.frame.layout() },
         match shared.film {
             FilmUse::Handed { .. } => usize::MAX,
             FilmUse::Banded { most, .. } => most,
@@ -152,6 +154,7 @@ pub fn run(shared: &Shared, attempt: &Attempt, stop: &dyn Stop) -> Result<Made, 
     }
     let unread = task.unread;
     textures.check()?;
+    film.keep_aovs(shared.frame.aovs);
     if !skips.makes(Skip::Film) {
         film.touch_all();
     }
@@ -185,7 +188,7 @@ fn store_film(
     match shared.film {
         FilmUse::Handed { stored } => {
             let film = film.into_part();
-            if stored && (film.touched() > 0 || film.rejected().count > 0) {
+            if stored && !film.is_empty() {
                 store(None, film.encode())?;
             }
             Ok((parts, Some(film)))

@@ -1,5 +1,6 @@
 //! Direct light in closed form, through every strategy: rays leave their tasks and come back, and the light is still right.
 
+use rayherd_render::aov::Aovs;
 use rayherd_render::camera::Camera;
 use rayherd_render::filter::Filter;
 use rayherd_render::frame::Frame;
@@ -57,6 +58,7 @@ fn frame(scene: &PreparedScene) -> Frame {
         rr_depth: 10,
         split: 1,
         hide_emitters: false,
+        aovs: Aovs::NONE,
     }
 }
 

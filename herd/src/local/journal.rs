@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
 use bytes::Bytes;
-use rayherd_render::film::FilmPart;
+use rayherd_render::film::{FilmPart, Layout};
 use rayherd_render::frame::Frame;
 
 use super::nodes::Nodes;
@@ -120,11 +120,11 @@ pub fn newest_of(image: &str, records: BTreeMap<String, Record>) -> Result<Chain
 /// It is found from the newest snapshot on. Where that names what is lost, it is found from an older one, which reaches the same
 /// state by the parts that were added since; where that does not help either, the last state is taken whose film is whole and that
 /// has no rays on their way.
-pub fn resume(nodes: &Nodes, image: &str, scope: &Scope, size: [u32; 2]) -> Result<Resumed, JobError> {
+pub fn resume(nodes: &Nodes, image: &str, scope: &Scope, layout: Layout) -> Result<Resumed, JobError> {
     let chain = newest_of(image, nodes.wait(read(nodes.store().as_ref()))?)?;
     let mut best: Option<Replayed> = None;
     for start in chain.starts() {
-        let found = replay(nodes, image, scope, size, &chain.records[start..])?;
+        let found = replay(nodes, image, scope, layout, &chain.records[start..])?;
         if let Some(why) = &found.lost {
             tracing::warn!("from the snapshot at place {}: {why}", chain.records[start].1.sequence);
         }
@@ -137,7 +137,7 @@ pub fn resume(nodes: &Nodes, image: &str, scope: &Scope, size: [u32; 2]) -> Resu
         }
     }
     let Some(Replayed { mut ledger, film, settled, lost }) = best else {
-        let (ledger, film) = (Ledger::new(image, scope.tiles), FilmPart::new(size));
+        let (ledger, film) = (Ledger::new(image, scope.tiles), FilmPart::new(layout));
         let settled = (ledger.snapshot(Vec::new()), film.clone());
         return Ok(Resumed { ledger, film, settled, reused: 0, lost: 0 });
     };
@@ -168,10 +168,10 @@ fn replay(
     nodes: &Nodes,
     image: &str,
     scope: &Scope,
-    size: [u32; 2],
+    layout: Layout,
     records: &[(String, Record)],
 ) -> Result<Replayed, JobError> {
-    let (mut ledger, mut film) = (Ledger::new(image, scope.tiles), FilmPart::new(size));
+    let (mut ledger, mut film) = (Ledger::new(image, scope.tiles), FilmPart::new(layout));
     let mut settled = (ledger.snapshot(Vec::new()), film.clone());
     let mut lost = None;
     for (number, (name, record)) in records.iter().enumerate() {
@@ -183,10 +183,10 @@ fn replay(
         }
         let mut parts = record.made.film.as_slice();
         if let Some(snapshot) = anew {
-            film = FilmPart::new(size);
+            film = FilmPart::new(layout);
             parts = snapshot.film.as_slice();
         }
-        match parts.iter().try_for_each(|part| merge(nodes, &mut film, part, size)) {
+        match parts.iter().try_for_each(|part| merge(nodes, &mut film, part, layout)) {
             Ok(()) if ledger.is_settled() => settled = (ledger.snapshot(Vec::new()), film.clone()),
             Ok(()) => {}
             Err(e @ JobError::Lost { .. }) => lost = Some(e),
@@ -214,14 +214,14 @@ fn whole(nodes: &Nodes, scope: &Scope, ledger: &Ledger) -> Result<(), JobError> 
     Ok(())
 }
 
-fn merge(nodes: &Nodes, film: &mut FilmPart, part: &FilmRef, size: [u32; 2]) -> Result<(), JobError> {
-    let part = nodes.get(0, ByteKind::Film, &part.key, &part.holders, |body| codec::open_film(size, body))?;
+fn merge(nodes: &Nodes, film: &mut FilmPart, part: &FilmRef, layout: Layout) -> Result<(), JobError> {
+    let part = nodes.get(0, ByteKind::Film, &part.key, &part.holders, |body| codec::open_film(layout, body))?;
     Ok(film.add_encoded(&part, 0..u32::MAX)?)
 }
 
 /// Stores a whole film under `prefix` and its hash: whoever names it means these bytes, whatever is stored later.
 pub fn store_film(nodes: &Nodes, film: &FilmPart, prefix: &str) -> Result<Vec<FilmRef>, JobError> {
-    if film.touched() == 0 && film.rejected().count == 0 {
+    if film.is_empty() {
         return Ok(Vec::new());
     }
     let body = codec::seal_film(&film.encode());

@@ -1,5 +1,7 @@
 //! An executor with virtual nodes, in one process.
 
+#[cfg(test)]
+mod aovs;
 pub mod attempt;
 #[cfg(test)]
 mod closed_forms;
@@ -20,6 +22,7 @@ mod textured;
 mod threads;
 pub mod usage;
 
+use rayherd_render::aov::Aov;
 use rayherd_render::film::FilmPart;
 use rayherd_render::frame::Frame;
 pub use run::render_local;
@@ -41,6 +44,9 @@ pub struct JobOutcome {
     /// What was done and counted.
     pub report: Report,
 }
+
+/// Integers from 1 that a float of 32 bits holds.
+const MOST_NUMBERS: usize = 1 << 24;
 
 /// Checks what can be checked before anything is read.
 pub(crate) fn check(
@@ -84,6 +90,13 @@ pub(crate) fn check(
              with fewer --splits or a larger --block-size",
             scene.splits()
         ));
+    }
+    for (aov, numbers) in [(Aov::ObjectId, scene.world.shapes.len()), (Aov::MaterialId, scene.world.materials.len())] {
+        if frame.aovs.contains(aov) && numbers > MOST_NUMBERS {
+            return refuse(format!(
+                "{aov}: {numbers} of them are more than {MOST_NUMBERS}, which its channel tells apart: leave it out"
+            ));
+        }
     }
     let needed = scene.grid.owning().iter().map(|s| scene.split_bytes(s)).max().unwrap_or(0);
     match settings.memory_per_node {

@@ -57,7 +57,7 @@ pub fn render_local(
         let start = Start {
             settled: ledger.snapshot(Vec::new()),
             ledger,
-            film: MemoryFilm::new(&shared.nodes, FilmPart::new(frame.size), FilmPart::new(frame.size)),
+            film: MemoryFilm::new(&shared.nodes, FilmPart::new(frame.layout()), FilmPart::new(frame.layout())),
             pointer: None,
             session: "job".to_owned(),
             reused: 0,
@@ -114,13 +114,13 @@ fn resume<'n, 'a>(
     may_resume: bool,
     spp: u32,
 ) -> Result<Start<MemoryFilm<'n, 'a>>, JobError> {
-    let (nodes, size) = (&shared.nodes, shared.frame.size);
+    let nodes = &shared.nodes;
     let place = nodes.store().describe();
     if !may_resume && !nodes.wait(nodes.store().list("records/"))?.is_empty() {
         return Err(holds_a_job(&place));
     }
     let image = shared.scene.image_name(shared.frame)?;
-    let resumed = journal::resume(nodes, &image, &journal::scope(shared.scene, shared.frame), size)?;
+    let resumed = journal::resume(nodes, &image, &journal::scope(shared.scene, shared.frame), shared.frame.layout())?;
     enough(&place, resumed.ledger.done().reach(), spp)?;
     let (settled, settled_film) = resumed.settled;
     Ok(Start {

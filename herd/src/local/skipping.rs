@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 use std::num::NonZeroU32;
 
+use rayherd_render::aov::Aovs;
 use rayherd_render::frame::Frame;
 use rayherd_render::skip::{Skip, Skips};
 
@@ -36,7 +37,7 @@ fn settings(scene: &PreparedScene, strategy: Strategy) -> JobSettings {
     }
 }
 
-/// The bundled scenes through all strategies, each in several splits.
+/// The bundled scenes through all strategies, each in several splits; some with AOVs.
 fn cases() -> Vec<Case> {
     let folder = tempfile::tempdir().unwrap();
     // its pictures are stored when it is prepared
@@ -51,7 +52,9 @@ fn cases() -> Vec<Case> {
         for strategy in Strategy::ALL {
             let reduced = matches!(strategy, Strategy::SchedulingGridOverlapReduced | Strategy::Auto);
             let scene = testing::prepared(&description, 9, reduced);
-            let (frame, settings) = (testing::frame(&scene, size, 3), settings(&scene, strategy));
+            let aovs = if out.len() % 3 == 0 { Aovs::ALL } else { Aovs::NONE };
+            let frame = Frame { aovs, ..testing::frame(&scene, size, 3) };
+            let settings = settings(&scene, strategy);
             out.push(Case { name: format!("{name}, {strategy}"), scene, frame, settings, spp });
         }
     }
@@ -73,7 +76,8 @@ impl Case {
 
 fn same(a: &JobOutcome, b: &JobOutcome) -> bool {
     let bits = |o: &JobOutcome| o.image.pixels.as_flattened().iter().map(|x| x.to_bits()).collect::<Vec<u32>>();
-    (bits(a), a.film.rejected(), a.spp) == (bits(b), b.film.rejected(), b.spp)
+    let aovs = |o: &JobOutcome| o.film.channels(o.spp, [0.0; 3]);
+    (bits(a), aovs(a), a.film.rejected(), a.spp) == (bits(b), aovs(b), b.film.rejected(), b.spp)
 }
 
 /// Known to whoever prepares: tested from outside, with the program.

@@ -7,15 +7,22 @@ use std::collections::BTreeSet;
 use std::io::{Seek, Write};
 use std::ops::Range;
 
-use rayherd_render::film::{ErrorSum, FilmPart, KEPT_KEYS, TILE};
+use rayherd_render::film::{ErrorSum, FilmPart, KEPT_KEYS, Layout, TILE};
 use serde_json::{Map, Value};
 
 use crate::job::JobError;
 use crate::ledger::FilmRef;
-use crate::picture;
+use crate::picture::{self, Row};
 
-/// Tiles of a band: 48 MiB of sums.
+/// Tiles of a band of a film without AOVs: 48 MiB of sums.
 pub const BAND: u32 = 512;
+
+/// Tiles of a band of another film, that take no more memory than `band` tiles without AOVs; one at least.
+pub fn tiles(band: u32, layout: Layout) -> u32 {
+    let light = Layout::from(layout.size).pixel_bytes() as u64;
+    // at most as many as there were
+    ((u64::from(band) * light / layout.pixel_bytes() as u64) as u32).max(1)
+}
 
 /// How many bands a film of `size` pixels has, each of so many tiles.
 pub fn count([width, height]: [u32; 2], band: u32) -> u32 {
@@ -24,8 +31,8 @@ pub fn count([width, height]: [u32; 2], band: u32) -> u32 {
 
 /// Adds up the film of a frame.
 pub struct Adder<'a> {
-    /// Width and height in pixels.
-    pub size: [u32; 2],
+    /// What it holds.
+    pub layout: Layout,
     /// Tiles of a band.
     pub band: u32,
     /// Reads a part: encoded and checked.
@@ -65,7 +72,7 @@ impl Adder<'_> {
     /// # Errors
     /// When a part cannot be read.
     pub fn sum(&self, parts: &[FilmRef], band: Option<u32>) -> Result<FilmPart, JobError> {
-        let mut sum = FilmPart::new(self.size);
+        let mut sum = FilmPart::new(self.layout);
         let tiles = band.map_or(0..u32::MAX, |b| self.tiles(b));
         for part in parts.iter().filter(|p| band.is_none() || p.band.is_none() || p.band == band) {
             sum.add_encoded(&(self.read)(part)?, tiles.clone())?;
@@ -73,7 +80,8 @@ impl Adder<'_> {
         Ok(sum)
     }
 
-    /// Writes the picture of `samples` samples per pixel, from the top down.
+    /// Writes the picture of `samples` samples per pixel with the layers of its AOVs, from the top down; `offset` as for
+    /// [`FilmPart::channels`].
     ///
     /// # Errors
     /// When a part cannot be read, or the picture cannot be written.
@@ -81,17 +89,20 @@ impl Adder<'_> {
         &self,
         parts: &[FilmRef],
         samples: u32,
+        offset: [f64; 3],
         definition: &Map<String, Value>,
         out: impl Write + Seek,
     ) -> Result<Totals, JobError> {
-        let [width, height] = self.size;
+        let Layout { size: [width, height], aovs } = self.layout;
         let across = width.div_ceil(TILE);
         let (mut totals, mut current): (Totals, Option<(u32, FilmPart)>) = Default::default();
-        // rows of the tiles that are being written
-        let mut rows = vec![[0.0; 3]; width as usize * TILE as usize];
-        let next = |y: u32, row: &mut [[f32; 3]]| -> Result<(), JobError> {
+        let beside: Vec<&str> = aovs.channels().collect();
+        // rows of the tiles that are being written, one after the other
+        let mut rows = Row::new(width as usize * TILE as usize, beside.len());
+        let next = |y: u32, row: &mut Row| -> Result<(), JobError> {
+            let at = |x: u32, y: u32| (y % TILE * width + x) as usize;
             if y.is_multiple_of(TILE) {
-                rows.fill([0.0; 3]);
+                rows.light.fill([0.0; 3]);
                 for tile in (y / TILE * across)..(y / TILE + 1) * across {
                     let band = tile / self.band.max(1);
                     if current.as_ref().is_none_or(|c| c.0 != band) {
@@ -102,17 +113,17 @@ impl Adder<'_> {
                         current = Some((band, sum));
                     }
                     if let Some((_, sum)) = &current {
-                        sum.resolve_tile(tile, samples, |x, y, value| {
-                            rows[(y % TILE * width + x) as usize] = value;
+                        sum.resolve_tile(tile, samples, |x, y, value| rows.light[at(x, y)] = value);
+                        sum.channels_of_tile(tile, samples, offset, |x, y, channel, value| {
+                            rows.beside[channel][at(x, y)] = value;
                         });
                     }
                 }
             }
-            let from = (y % TILE * width) as usize;
-            row.copy_from_slice(&rows[from..from + width as usize]);
+            row.copy_from(&rows, at(0, y));
             Ok(())
         };
-        picture::write([width, height], definition, next, out)?;
+        picture::write([width, height], &beside, definition, next, out)?;
         Ok(totals)
     }
 }

@@ -9,6 +9,7 @@ use rayherd_scene::manifest::Manifest;
 use rayherd_scene::objects::{ObjectRef, ObjectStore};
 use tokio::runtime::Handle;
 
+use super::bands;
 use super::guard::Guard;
 use super::message::{Done, Stage, Work};
 use super::parts::Parts;
@@ -66,7 +67,7 @@ pub struct Job<'a> {
     pub turns: &'a Turns,
     /// Slots of each worker.
     pub slots: Vec<u32>,
-    /// Tiles of a band of the film ([`super::bands`]).
+    /// Tiles of a band of a film without AOVs ([`super::bands`]).
     pub band: u32,
     /// Where input and output runs; not the caller's thread.
     pub runtime: Handle,
@@ -109,6 +110,7 @@ fn frames(job: &Job, keeper: &Arc<dyn Keeper>, progress: &dyn Progress) -> Resul
         let stage = Stage {
             id: format!("{}-{number}", job.session),
             scene: reference,
+            band: bands::tiles(job.band, frame.layout()),
             frame,
             prefix: format!("{}/{number}", job.prefix),
             strategy: spec.strategy,
@@ -116,7 +118,6 @@ fn frames(job: &Job, keeper: &Arc<dyn Keeper>, progress: &dyn Progress) -> Resul
             replicas,
             near: spec.placement != Placement::None,
             buckets: job.slots.iter().sum(),
-            band: job.band,
         };
         let (at, mut report) = render(job, keeper, progress, &scene, &stage, &places, &sampling, (number, picture))?;
         // known to whoever prepared the scene

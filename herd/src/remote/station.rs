@@ -36,7 +36,7 @@ const PAUSE: Duration = Duration::from_millis(500);
 /// After work that did not come out for now, before more is asked for: doubled for each such failure in a row, up to the longest.
 const FIRST_REST: Duration = Duration::from_millis(125);
 const LONGEST_REST: Duration = Duration::from_secs(4);
-/// Film tiles that a task holds as sums: 96 MiB.
+/// Film tiles without AOVs whose memory a task's sums take at most: 96 MiB.
 const TILES: usize = 1024;
 /// How long a report is offered to an operator that does not answer.
 const PATIENCE: Duration = Duration::from_secs(120);
@@ -330,10 +330,10 @@ impl<'l> Station<'l> {
             Work::Merge { name, parts, spp, picture, band } => {
                 let (stage, shared) = open()?;
                 let read = |part: &FilmRef| {
-                    let open = |body: &bytes::Bytes| codec::open_film(stage.frame.size, body);
+                    let open = |body: &bytes::Bytes| codec::open_film(stage.frame.layout(), body);
                     shared.nodes.get(self.node(), Kind::Film, &part.key, &part.holders, open)
                 };
-                let adder = Adder { size: stage.frame.size, band: stage.band, read: &read };
+                let adder = Adder { layout: stage.frame.layout(), band: stage.band, read: &read };
                 match picture {
                     Some(key) => self.picture(&adder, shared, parts, *spp, key),
                     None => self.merge(&adder, shared, name.as_deref(), (parts, *band), *spp),
@@ -390,7 +390,7 @@ impl<'l> Station<'l> {
     ) -> Result<Done, JobError> {
         let sum = adder.sum(parts, band)?;
         let film = match name {
-            Some(key) if sum.touched() > 0 || sum.rejected().count > 0 => {
+            Some(key) if !sum.is_empty() => {
                 let body = codec::seal_film(&sum.encode());
                 let bytes = body.len() as u64;
                 let holders = shared.nodes.put(self.node(), Kind::Film, key, body)?;
@@ -418,7 +418,8 @@ impl<'l> Station<'l> {
         // gone with the value
         let file = tempfile::NamedTempFile::new_in(&self.scratch).map_err(io)?;
         let definition = definition(&shared.scene.manifest, shared.frame, spp)?;
-        let totals = adder.picture(parts, spp, &definition, BufWriter::new(file.as_file()))?;
+        let offset = shared.scene.manifest.offset;
+        let totals = adder.picture(parts, spp, offset, &definition, BufWriter::new(file.as_file()))?;
         let mut at = Vec::new();
         let mut error = None;
         // on every store, so that each of them shows it
@@ -446,7 +447,7 @@ fn merged(
     non_finite: Vec<(u32, u32)>,
     picture: Vec<String>,
 ) -> Done {
-    Done::Merged { film, rel_mse: error.map(|e| e.mean(adder.size)), error, non_finite, picture }
+    Done::Merged { film, rel_mse: error.map(|e| e.mean(adder.layout.size)), error, non_finite, picture }
 }
 
 /// Reads blocks from the store at home first, then from where they belong, then from anywhere.

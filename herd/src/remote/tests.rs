@@ -5,14 +5,16 @@ use std::sync::atomic::{AtomicU32, Ordering};
 use std::sync::{Arc, LazyLock, Mutex};
 use std::time::{Duration, Instant};
 
-use rayherd_api::{RenderJobSpec, Strategy};
+use rayherd_api::{Aov, RenderJobSpec, Strategy};
+use rayherd_render::aov::Aovs;
+use rayherd_render::film::Layout;
 use rayherd_render::skip::Skip;
 use rayherd_scene::import::{DescriptionSource, StreamOptions, import};
 use rayherd_scene::objects::{MemoryObjects, ObjectRef};
 use rayherd_scene::prepare::{NoProgress, SpoolSettings, prepare};
 use tokio::runtime::{Handle, Runtime};
 
-use super::bands::BAND;
+use super::bands::{self, BAND};
 use super::frames::{Job, Keeper, run};
 use super::message::{Answer, Beat, Poll, Report, WorkerId};
 use super::{Depot, Fleet, Link, LinkError, Station, Turns};
@@ -118,6 +120,8 @@ fn spec(strategy: Strategy, splits: i64, replicas: i32) -> RenderJobSpec {
         RenderJobSpec { strategy, splits: Some(splits), replicas: Some(replicas), ..RenderJobSpec::default() };
     spec.scene.source = SOURCE.into();
     spec.image.size = Some("48x40".parse().unwrap());
+    // of some jobs the picture has layers
+    spec.image.aovs = (replicas == 2).then(|| Aov::ALL.to_vec());
     spec.sampling.spp = Some(6);
     spec.sampling.max_depth = Some(5);
     spec.task_seconds = Some(0.01);
@@ -144,8 +148,9 @@ fn local(spec: &RenderJobSpec) -> (Vec<u8>, report::Report) {
     let frame = from_spec::frame(spec, &scene.manifest, None).unwrap();
     let sampling = Sampling { spp: 6, target_error: None, time_limit: None };
     let out = render_local(&scene, &frame, &sampling, &JobSettings::default(), &Silent).unwrap();
-    let file = picture::encode(&out.image, &from_spec::definition(&scene.manifest, &frame, out.spp).unwrap()).unwrap();
-    (file, out.report)
+    let definition = from_spec::definition(&scene.manifest, &frame, out.spp).unwrap();
+    let layers = out.film.channels(out.spp, scene.manifest.offset);
+    (picture::encode(&out.image, &layers, &definition).unwrap(), out.report)
 }
 
 struct Cluster {
@@ -153,7 +158,7 @@ struct Cluster {
     runtime: Runtime,
     scratch: tempfile::TempDir,
     turns: Turns,
-    /// Tiles of a band, of four that the film has.
+    /// Tiles of a band, of four that the film has, without AOVs: with all of them it takes 11 for 3.
     band: u32,
 }
 
@@ -255,15 +260,16 @@ fn wait_for(what: impl Fn() -> bool) {
 
 #[test]
 fn every_strategy_makes_the_bytes_of_a_local_run() {
-    for (strategy, splits, memory, band) in [
-        (Strategy::Auto, 1, None, BAND),
-        (Strategy::Auto, 6, Some("64Ki"), 1),
-        (Strategy::DemandDriven, 4, None, 3),
-        (Strategy::SchedulingGrid, 4, None, 1),
-        (Strategy::SchedulingGridOverlapReduced, 4, None, BAND),
-        (Strategy::SchedulingGridOverlapReduced, 4, None, 2),
+    for (strategy, splits, memory, band, layers) in [
+        (Strategy::Auto, 1, None, BAND, true),
+        (Strategy::Auto, 6, Some("64Ki"), 1, false),
+        (Strategy::DemandDriven, 4, None, 11, true),
+        (Strategy::SchedulingGrid, 4, None, 1, true),
+        (Strategy::SchedulingGridOverlapReduced, 4, None, BAND, false),
+        (Strategy::SchedulingGridOverlapReduced, 4, None, 2, false),
     ] {
         let mut spec = spec(strategy, splits, 2);
+        spec.image.aovs = spec.image.aovs.filter(|_| layers);
         spec.workers.memory = memory.map(|m: &str| m.parse().unwrap());
         let (cluster, kept) = (Cluster { band, ..Cluster::new(2) }, Arc::new(Kept::default()));
         if let Err(e) = cluster.render(&spec, &kept) {
@@ -424,7 +430,9 @@ fn a_film_that_was_stored_in_other_parts_goes_on() {
     let mut spec = spec(Strategy::SchedulingGridOverlapReduced, 4, 2);
     spec.task_seconds = Some(0.003);
     let want = expected(&spec);
-    for (first, then) in [(BAND, 1), (BAND, 3), (BAND, BAND)] {
+    let layout = Layout { size: [48, 40], aovs: Aovs::ALL };
+    assert_eq!([1, 8, 11, BAND].map(|band| bands::tiles(band, layout)), [1, 2, 3, 139]);
+    for (first, then, tiles) in [(BAND, 1, 1), (BAND, 11, 3), (BAND, BAND, 139)] {
         let (cluster, kept) = (Cluster { band: first, ..Cluster::new(3) }, Arc::new(Kept::default()));
         begun(&cluster, &spec, &kept, 30);
         let cluster = Cluster { band: then, ..cluster };
@@ -441,7 +449,7 @@ fn a_film_that_was_stored_in_other_parts_goes_on() {
             .max_by_key(|r| r.sequence)
             .and_then(|r| Some(r.snapshot.as_ref()?.film.iter().map(|f| f.band).collect()))
             .expect("a job ends with a snapshot");
-        let all = (0..4u32.div_ceil(then)).map(|b| (then < 4).then_some(b)).collect();
+        let all = (0..4u32.div_ceil(tiles)).map(|b| (tiles < 4).then_some(b)).collect();
         assert_eq!(bands, all);
         // parts that were added up are deleted, all but those of the last snapshots and of the last state without rays on their way
         for store in &cluster.stores {

@@ -117,6 +117,7 @@ pub fn tile_pixels(frame: &Frame, number: u32) -> u32 {
 mod tests {
     use std::collections::BTreeSet;
 
+    use rayherd_render::aov::Aovs;
     use rayherd_render::camera::Camera;
     use rayherd_render::filter::Filter;
 
@@ -136,6 +137,7 @@ mod tests {
             rr_depth: 5,
             split: 1,
             hide_emitters: false,
+            aovs: Aovs::NONE,
         };
         let units: Vec<CameraUnit> = (0..tiles(&frame)).map(|tile| CameraUnit { tile, first: 2, end: 5 }).collect();
         assert_eq!(units.len(), 6);

@@ -1,16 +1,16 @@
 //! Rays and film parts as the bodies of objects, checked against the scene.
 
 use bytes::Bytes;
-use rayherd_render::film::FilmPart;
+use rayherd_render::film::{FilmPart, Layout};
 
 use crate::flight::Flights;
 use crate::job::PreparedScene;
 use crate::wire::WireError;
 use crate::wire::envelope::{Compress, Kind, open, seal};
 
-/// Largest film of a picture of this size, bytes: 96 of sums a pixel with their heads, and what comes once.
-fn film_limit([width, height]: [u32; 2]) -> usize {
-    (width as usize * height as usize).saturating_mul(128).saturating_add(1 << 20)
+/// Largest film of this layout, bytes: 96 of sums a pixel and 16 for each sum of its AOVs, with their heads, and what comes once.
+fn film_limit(Layout { size: [width, height], aovs }: Layout) -> usize {
+    (width as usize * height as usize).saturating_mul(128 + 20 * aovs.sums()).saturating_add(1 << 20)
 }
 
 /// Whether rays name only splits and cells that the scene has.
@@ -30,8 +30,8 @@ pub fn seal_film(part: &[u8]) -> Bytes {
 }
 
 /// An encoded film part from an object, checked: [`FilmPart::add_encoded`] takes it.
-pub fn open_film(size: [u32; 2], body: &[u8]) -> Result<Vec<u8>, WireError> {
-    let part = open(Kind::FilmPart, body, film_limit(size))?;
-    FilmPart::check(&part, size).map_err(|e| WireError::corrupt(e.to_string()))?;
+pub fn open_film(layout: Layout, body: &[u8]) -> Result<Vec<u8>, WireError> {
+    let part = open(Kind::FilmPart, body, film_limit(layout))?;
+    FilmPart::check(&part, layout).map_err(|e| WireError::corrupt(e.to_string()))?;
     Ok(part)
 }

@@ -5,7 +5,7 @@
 
 use rayherd_render::bvh::{Kernel, Tracer, UnsupportedKernel};
 use rayherd_render::film::BoundedFilm;
-use rayherd_render::path::{Context, Outcome, PathRay, Surface, Surfaces, shade, shade_traced};
+use rayherd_render::path::{Context, Outcome, PathRay, Surface, Surfaces, shade, shade_traced, take_aovs};
 use rayherd_render::ray::{Hit, MISS, PrimId, Ray};
 use rayherd_render::skip::{Skip, SkipCounts, Skips};
 use rayherd_scene::grid::{Grid, SplitSet};
@@ -135,7 +135,9 @@ impl Loop {
             self.skipped.add(Skip::Walk, self.hits.len() as u64);
             let (paths, traced, hits, out) = (&pending[from..], &rays[from..], &self.hits, &mut self.outcome);
             if hits.iter().any(Hit::is_hit) {
-                shade_traced(context, shading.surfaces()?, paths, traced, hits, out);
+                let surfaces = shading.surfaces()?;
+                shade_traced(context, surfaces, paths, traced, hits, out);
+                beside_light(context, surfaces, paths, hits, out, film, &mut self.skipped);
             } else {
                 shade_traced(context, &NoSurfaces, paths, traced, hits, out);
             }
@@ -218,7 +220,9 @@ impl Loop {
                 }
             }
             if ready_hits.iter().any(Hit::is_hit) {
-                shade(context, shading.surfaces()?, &ready, &ready_hits, &mut self.outcome);
+                let (surfaces, out) = (shading.surfaces()?, &mut self.outcome);
+                shade(context, surfaces, &ready, &ready_hits, out);
+                beside_light(context, surfaces, &ready, &ready_hits, out, film, &mut self.skipped);
             } else {
                 shade(context, &NoSurfaces, &ready, &ready_hits, &mut self.outcome);
             }
@@ -314,6 +318,7 @@ impl Loop {
             return Err(absent(&batch[i]));
         }
         shade(context, surfaces, &rays, &self.hits, &mut self.outcome);
+        beside_light(context, surfaces, &rays, &self.hits, &self.outcome, film, &mut self.skipped);
         self.collect(film);
         self.take_spawned(out);
         Ok(())
@@ -342,6 +347,25 @@ impl Loop {
     /// Where a ray goes next; see [`Visit::next`].
     pub fn next(&mut self, visit: Visit, grid: &Grid, ray: &Ray, resident: &SplitSet) -> Option<(u32, Visit)> {
         visit.next(grid, ray, resident, &mut self.cells)
+    }
+}
+
+/// What the film's AOVs want of a batch that was shaded: asked once for all of it.
+fn beside_light<S: Surfaces>(
+    context: &Context,
+    surfaces: &S,
+    rays: &[PathRay],
+    hits: &[Hit],
+    shaded: &Outcome,
+    film: &mut BoundedFilm,
+    skipped: &mut SkipCounts,
+) {
+    if film.aovs().is_empty() {
+        skipped.add(Skip::Aovs, rays.len() as u64);
+    } else {
+        take_aovs(context, surfaces, rays, hits, &shaded.shadow, film.aovs(), |aov, pixel, sample, values| {
+            film.add_aov(aov, pixel, sample, values);
+        });
     }
 }
 

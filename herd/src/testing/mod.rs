@@ -3,6 +3,7 @@
 use std::path::Path;
 use std::sync::Arc;
 
+use rayherd_render::aov::Aovs;
 use rayherd_render::camera::Camera;
 use rayherd_render::filter::Filter;
 use rayherd_render::frame::Frame;
@@ -98,6 +99,7 @@ pub fn cornell() -> Description {
         max_depth: None,
         rr_depth: None,
         hide_emitters: false,
+        aovs: None,
         substitutions: vec![],
         notes: vec![],
         bounds: None,
@@ -329,5 +331,5 @@ pub fn frame(scene: &PreparedScene, size: [u32; 2], split: u32) -> Frame {
     let to_world = [[-1.0, 0.0, 0.0, 0.05], [0.0, 1.0, 0.0, -0.1], [0.0, 0.0, -1.0, 3.3]];
     let camera = Camera::new(&to_world, 45.0, size, scene.manifest.offset).unwrap();
     let filter = Filter::Tent { radius: 1.0 };
-    Frame { camera, size, filter, seed: 7, max_depth: 6, rr_depth: 3, split, hide_emitters: false }
+    Frame { camera, size, filter, seed: 7, max_depth: 6, rr_depth: 3, split, hide_emitters: false, aovs: Aovs::NONE }
 }

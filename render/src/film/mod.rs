@@ -6,9 +6,12 @@
 //!
 //! A contribution that is not finite, is negative, or is 2^38 or more is not added: it is counted, and the smallest
 //! [`KEPT_KEYS`] of the (pixel, sample) that made one are kept to replay them. Sums stay exact below 2^63 per pixel and half.
+//!
+//! AOVs are summed likewise, beside the light ([`FilmPart::add_aov`]); without any a film is what it is without them.
 
 mod bounded;
 mod code;
+mod planes;
 mod resolve;
 #[cfg(test)]
 mod tests;
@@ -18,7 +21,10 @@ use std::ops::Range;
 
 pub use bounded::BoundedFilm;
 pub use code::FilmError;
-pub use resolve::ErrorSum;
+pub use resolve::{Channel, ErrorSum};
+
+use crate::aov::Aovs;
+use planes::Planes;
 
 /// Width and height of a tile in pixels.
 pub const TILE: u32 = 32;
@@ -30,6 +36,8 @@ const LIMIT: f32 = 274_877_906_944.0; // 2^38
 
 /// Sums of one pixel: by half, by channel.
 type Sums = [[i128; 3]; 2];
+/// How many these are.
+const LIGHT: usize = 6;
 
 /// Sums of one tile, row by row.
 #[derive(Clone, PartialEq, Eq, Debug)]
@@ -39,6 +47,38 @@ impl Tile {
     fn new() -> Tile {
         Tile(vec![[[0; 3]; 2]; (TILE * TILE) as usize].into_boxed_slice())
     }
+
+    /// All sums side by side, [`LIGHT`] of each pixel.
+    fn sums(&self) -> &[i128] {
+        self.0.as_flattened().as_flattened()
+    }
+
+    fn sums_mut(&mut self) -> &mut [i128] {
+        self.0.as_flattened_mut().as_flattened_mut()
+    }
+}
+
+/// What a film holds: only films of one layout add up.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub struct Layout {
+    /// Width and height in pixels, each from 1 to 65535.
+    pub size: [u32; 2],
+    /// What is taken beside light.
+    pub aovs: Aovs,
+}
+
+impl Layout {
+    /// Memory of a pixel's sums in bytes: 96, and 16 for each sum of the AOVs.
+    pub fn pixel_bytes(self) -> usize {
+        size_of::<Sums>() + self.aovs.sums() * size_of::<i128>()
+    }
+}
+
+impl From<[u32; 2]> for Layout {
+    /// Light alone.
+    fn from(size: [u32; 2]) -> Layout {
+        Layout { size, aovs: Aovs::NONE }
+    }
 }
 
 /// A film, or the part of one that some task filled.
@@ -46,6 +86,7 @@ impl Tile {
 pub struct FilmPart {
     size: [u32; 2],
     tiles: Vec<Option<Tile>>,
+    planes: Planes,
     rejected: Rejected,
 }
 
@@ -80,10 +121,11 @@ impl Rejected {
 }
 
 impl FilmPart {
-    /// An empty film of `size` pixels, each way from 1 to 65535.
-    pub fn new(size: [u32; 2]) -> FilmPart {
+    /// An empty film; of a size alone one without AOVs.
+    pub fn new(layout: impl Into<Layout>) -> FilmPart {
+        let Layout { size, aovs } = layout.into();
         let tiles = size[0].div_ceil(TILE) as usize * size[1].div_ceil(TILE) as usize;
-        FilmPart { size, tiles: vec![None; tiles], rejected: Rejected::default() }
+        FilmPart { size, tiles: vec![None; tiles], planes: Planes::new(aovs, tiles), rejected: Rejected::default() }
     }
 
     /// Width and height in pixels.
@@ -96,7 +138,12 @@ impl FilmPart {
         &self.rejected
     }
 
-    /// Tiles that were touched.
+    /// Whether there is nothing to keep: no light, no AOV, nothing rejected.
+    pub fn is_empty(&self) -> bool {
+        self.rejected.count == 0 && !(0..self.tiles.len()).any(|tile| self.holds(tile))
+    }
+
+    /// Tiles that light touched.
     pub fn touched(&self) -> usize {
         self.tiles.iter().flatten().count()
     }
@@ -109,11 +156,13 @@ impl FilmPart {
     /// Touches all tiles, so that all are held and stored.
     pub fn touch_all(&mut self) {
         self.tiles.iter_mut().for_each(|tile| _ = tile.get_or_insert_with(Tile::new));
+        self.planes.touch_all();
     }
 
     /// Memory of the sums in bytes.
     pub fn memory(&self) -> usize {
-        self.touched() * (TILE * TILE) as usize * size_of::<Sums>() + self.tiles.len() * size_of::<Option<Tile>>()
+        let light = self.touched() * (TILE * TILE) as usize * size_of::<Sums>();
+        light + self.tiles.len() * size_of::<Option<Tile>>() + self.planes.memory()
     }
 
     /// Adds a contribution to pixel `y * width + x` (below width * height).
@@ -159,10 +208,19 @@ impl FilmPart {
         }
     }
 
+    /// Whether there are sums of a tile, of light or of AOVs.
+    fn holds(&self, tile: usize) -> bool {
+        self.tiles[tile].is_some() || self.planes.get(tile).is_some()
+    }
+
     /// Tile of a pixel, and its place in the tile.
     #[inline]
     fn place(&self, pixel: u32) -> (usize, usize) {
-        let (x, y) = (pixel % self.size[0], pixel / self.size[0]);
+        self.place_at(pixel % self.size[0], pixel / self.size[0])
+    }
+
+    #[inline(always)]
+    fn place_at(&self, x: u32, y: u32) -> (usize, usize) {
         let tile = y / TILE * self.size[0].div_ceil(TILE) + x / TILE;
         (tile as usize, (y % TILE * TILE + x % TILE) as usize)
     }
@@ -178,15 +236,14 @@ impl FilmPart {
         if self.size != other.size {
             return Err(FilmError::Size { expected: self.size, found: other.size });
         }
+        self.planes.merge(&other.planes)?;
         for (mine, theirs) in self.tiles.iter_mut().zip(&other.tiles) {
             let Some(theirs) = theirs else { continue };
             let Some(mine) = mine else {
                 *mine = Some(theirs.clone());
                 continue;
             };
-            for (a, b) in
-                mine.0.as_flattened_mut().as_flattened_mut().iter_mut().zip(theirs.0.as_flattened().as_flattened())
-            {
+            for (a, b) in mine.sums_mut().iter_mut().zip(theirs.sums()) {
                 *a = a.wrapping_add(*b);
             }
         }
@@ -202,8 +259,9 @@ impl FilmPart {
 
     fn sums(&self, x: u32, y: u32) -> &Sums {
         const NONE: Sums = [[0; 3]; 2];
-        match &self.tiles[(y / TILE * self.size[0].div_ceil(TILE) + x / TILE) as usize] {
-            Some(tile) => &tile.0[(y % TILE * TILE + x % TILE) as usize],
+        let (tile, at) = self.place_at(x, y);
+        match &self.tiles[tile] {
+            Some(tile) => &tile.0[at],
             None => &NONE,
         }
     }

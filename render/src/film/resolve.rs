@@ -5,6 +5,7 @@ use std::ops::AddAssign;
 use serde::{Deserialize, Serialize};
 
 use super::{FilmPart, Sums, TILE};
+use crate::aov::Aov;
 
 /// 2^-64, in which sums of errors are counted as sums of light are.
 const UNIT: f64 = 1.0 / 18_446_744_073_709_551_616.0;
@@ -39,6 +40,15 @@ impl From<ErrorSum> for [u64; 2] {
     fn from(sum: ErrorSum) -> Self {
         [(sum.0 >> 64) as u64, sum.0 as u64]
     }
+}
+
+/// A channel of a picture, beside its light.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Channel {
+    /// `LAYER.NAME`.
+    pub name: &'static str,
+    /// Row by row, width * height values.
+    pub values: Vec<f32>,
 }
 
 impl FilmPart {
@@ -80,13 +90,20 @@ impl FilmPart {
     /// The picture's pixels in a tile, as [`FilmPart::resolve`] has them: column, row and value of each; none where nothing was touched.
     pub fn resolve_tile(&self, number: u32, samples: u32, mut put: impl FnMut(u32, u32, [f32; 3])) {
         let Some(tile) = &self.tiles[number as usize] else { return };
+        self.pixels_of(number, |x, y, at| {
+            let [a, b] = &tile.0[at];
+            put(x, y, std::array::from_fn(|c| quotient(a[c].wrapping_add(b[c]), samples)));
+        });
+    }
+
+    /// Column and row of each of a tile's pixels, and its place in the tile.
+    fn pixels_of(&self, number: u32, mut each: impl FnMut(u32, u32, usize)) {
         let [width, height] = self.size;
         let across = width.div_ceil(TILE);
         let (left, top) = (number % across * TILE, number / across * TILE);
         for y in top..height.min(top + TILE) {
             for x in left..width.min(left + TILE) {
-                let [a, b] = &tile.0[((y - top) * TILE + x - left) as usize];
-                put(x, y, std::array::from_fn(|c| quotient(a[c].wrapping_add(b[c]), samples)));
+                each(x, y, ((y - top) * TILE + x - left) as usize);
             }
         }
     }
@@ -101,27 +118,74 @@ impl FilmPart {
         }
         Some(out)
     }
+
+    /// The channels of its AOVs after `samples` samples per pixel (at least 1), in the order of [`crate::aov::Aovs::channels`]; see [`Aov`] for what they
+    /// mean. `offset` is what was taken from the scene's coordinates to recentre them: positions get it back, in f64, before they are rounded.
+    pub fn channels(&self, samples: u32, offset: [f64; 3]) -> Vec<Channel> {
+        let pixels = self.size[0] as usize * self.size[1] as usize;
+        let empty = |name| Channel { name, values: vec![0.0; pixels] };
+        let mut out: Vec<Channel> = self.aovs().channels().map(empty).collect();
+        for tile in 0..self.tiles() as u32 {
+            self.channels_of_tile(tile, samples, offset, |x, y, channel, value| {
+                out[channel].values[y as usize * self.size[0] as usize + x as usize] = value;
+            });
+        }
+        out
+    }
+
+    /// Their values in a tile, touched or not: column, row, number of the channel, and value.
+    pub fn channels_of_tile(
+        &self,
+        number: u32,
+        samples: u32,
+        offset: [f64; 3],
+        mut put: impl FnMut(u32, u32, usize, f32),
+    ) {
+        let mut first = 0;
+        for aov in self.aovs().iter() {
+            let channels = aov.channels().len();
+            self.pixels_of(number, |x, y, at| {
+                let sums = self.planes.sums(aov, (number as usize, at));
+                for c in 0..channels {
+                    let value = match (aov, sums) {
+                        (Aov::Variance, _) => variance(self.sums(x, y), c, samples).map_or(f32::INFINITY, |v| v as f32),
+                        (_, None) => 0.0,
+                        (Aov::ObjectId | Aov::MaterialId, Some(sums)) => quotient(sums[c], 1),
+                        (Aov::Position, Some(sums)) => {
+                            let (sum, times) = (sums[c] as f64 * UNIT, sums[3] as f64 * UNIT);
+                            ((sum + offset[c] * times) / f64::from(samples)) as f32
+                        }
+                        (_, Some(sums)) => quotient(sums[c], samples),
+                    };
+                    put(x, y, first + c, value);
+                }
+            });
+            first += channels;
+        }
+    }
 }
 
-/// Sum over the channels of Var / (M^2 + 0.01).
-fn pixel_error(sums: &Sums, samples: u32) -> Option<f64> {
+/// Estimated variance of a channel's mean, as in [`FilmPart::rel_mse`].
+fn variance([a, b]: &Sums, c: usize, samples: u32) -> Option<f64> {
     if samples < 2 {
         return None;
     }
     let n = f64::from(samples);
     let n_b = f64::from(samples / 2);
     let n_a = n - n_b;
+    let difference = a[c] as f64 * UNIT / n_a - b[c] as f64 * UNIT / n_b;
+    Some(difference * difference * (n_a * n_b / (n * n)))
+}
+
+/// Sum over the channels of Var / (M^2 + 0.01).
+fn pixel_error(sums: &Sums, samples: u32) -> Option<f64> {
     let [a, b] = sums;
-    Some(
-        (0..3)
-            .map(|c| {
-                let (a, b) = (a[c] as f64 * UNIT, b[c] as f64 * UNIT);
-                let mean = (a + b) / n;
-                let difference = a / n_a - b / n_b;
-                difference * difference * (n_a * n_b / (n * n)) / (mean * mean + 0.01)
-            })
-            .sum(),
-    )
+    let mut error = 0.0;
+    for c in 0..3 {
+        let mean = (a[c] as f64 * UNIT + b[c] as f64 * UNIT) / f64::from(samples);
+        error += variance(sums, c, samples)? / (mean * mean + 0.01);
+    }
+    Some(error)
 }
 
 /// `sum 2^-64 / n`, rounded once to the nearest float, ties to even.

@@ -1,6 +1,7 @@
 use rayherd_tests::mutation;
 
 use super::*;
+use crate::aov::Aov;
 use crate::testing::Rng;
 
 const SIZE: [u32; 2] = [70, 45];
@@ -306,4 +307,233 @@ fn tiles_are_read_alone() {
     }
     assert!(sum.add_encoded(&FilmPart::new([1, 1]).encode(), 0..6).is_err());
     assert_eq!(sum, before);
+}
+
+const BESIDE: [Aov; 4] = [Aov::Normal, Aov::Position, Aov::ObjectId, Aov::Cost];
+
+fn beside() -> Layout {
+    Layout { size: SIZE, aovs: BESIDE.into_iter().collect() }
+}
+
+/// Values of either sign for AOVs.
+fn random_aovs(seed: u64, n: usize) -> Vec<(Aov, u32, u32, Vec<f32>)> {
+    let mut rng = Rng(seed);
+    let mut one = || {
+        let aov = BESIDE[(rng.u32() % 4) as usize];
+        let scale = 2.0f32.powi((rng.u32() % 60) as i32 - 40);
+        let pixel = rng.u32() % (SIZE[0] * SIZE[1]);
+        let values = (0..aov.sums()).map(|_| rng.range(-1.0, 1.0) * scale).collect();
+        (aov, pixel, rng.u32() % 16, values)
+    };
+    (0..n).map(|_| one()).collect()
+}
+
+fn filled_beside(adds: &[(Aov, u32, u32, Vec<f32>)]) -> FilmPart {
+    let mut film = FilmPart::new(beside());
+    adds.iter().for_each(|(aov, pixel, sample, values)| film.add_aov(*aov, *pixel, *sample, values));
+    film
+}
+
+#[test]
+fn sums_of_aovs_are_the_plain_twins_in_any_order_and_parts() {
+    let adds = random_aovs(11, 30_000);
+    let whole = filled_beside(&adds);
+    let mut twin = std::collections::BTreeMap::<(Aov, u32, usize), f64>::new();
+    for (aov, pixel, _, values) in &adds {
+        for (c, &x) in values.iter().enumerate() {
+            *twin.entry((*aov, *pixel, c)).or_default() += f64::from(x);
+        }
+    }
+    let channels = whole.channels(7, [0.0; 3]);
+    for aov in BESIDE {
+        for (c, name) in aov.channels().iter().enumerate() {
+            let channel = channels.iter().find(|c| c.name == *name).unwrap();
+            for (pixel, &found) in channel.values.iter().enumerate() {
+                let sum = twin.get(&(aov, pixel as u32, c)).copied().unwrap_or(0.0);
+                let expected = if aov == Aov::ObjectId { sum } else { sum / 7.0 };
+                // of numbers up to 2^19 that cancel each other, in f64
+                assert!(
+                    (f64::from(found) - expected).abs() <= expected.abs() * 1e-7 + 1e-8,
+                    "{name}: {found} {expected}"
+                );
+            }
+        }
+    }
+    let mut shuffled = adds.clone();
+    let mut rng = Rng(12);
+    for i in (1..shuffled.len()).rev() {
+        shuffled.swap(i, rng.u32() as usize % (i + 1));
+    }
+    let mut merged = FilmPart::new(beside());
+    for part in shuffled.chunks(7000).rev() {
+        let part = filled_beside(part);
+        assert!(!part.is_empty() && part.touched() == 0);
+        merged.merge(&FilmPart::decode(&part.encode(), beside()).unwrap()).unwrap();
+    }
+    assert_eq!(merged, whole);
+    assert_eq!(merged.encode(), whole.encode());
+    // beside light as without
+    let light = random_adds(13, 5000);
+    light.iter().for_each(|&(pixel, sample, value)| merged.add(pixel, sample, value));
+    assert_eq!(merged.resolve(3), filled(&light).resolve(3));
+    assert_eq!(merged.channels(7, [0.0; 3]), channels);
+    assert_eq!(FilmPart::decode(&merged.encode(), beside()).unwrap(), merged);
+    merged.keep_aovs(Aovs::NONE);
+    assert_eq!(merged, filled(&light));
+    assert_eq!(merged.encode(), filled(&light).encode());
+}
+
+/// A film with AOVs that holds few tiles is the film that holds all, by bands too, and holds no more memory than it may.
+#[test]
+fn a_bounded_film_with_aovs_is_the_whole_one_in_less_memory() {
+    let (light, mut aovs) = (random_adds(20, 10_000), random_aovs(21, 10_000));
+    aovs.extend((0..40).map(|i| (Aov::Cost, i * 70, i, vec![f32::NAN])));
+    let mut whole = filled_beside(&aovs);
+    light.iter().for_each(|&(pixel, sample, value)| whole.add(pixel, sample, value));
+    let tile = beside().pixel_bytes() * (TILE * TILE) as usize;
+    let places = whole.memory() - 6 * tile;
+    // of light alone; of 15 sums a pixel there are 6 of light
+    for most in [1, 5, 8, 14, 15, 100] {
+        let mut bounded = BoundedFilm::new(beside(), most);
+        for (light, aovs) in light.chunks(97).zip(aovs.chunks(97)) {
+            bounded.add_all(light.iter().copied());
+            let held = |film: &BoundedFilm| film.part.memory() - places;
+            assert!(held(&bounded) <= (most * 6 / 15).max(1) * tile);
+            for (aov, pixel, sample, values) in aovs {
+                bounded.add_aov(*aov, *pixel, *sample, values);
+            }
+            assert!(held(&bounded) <= (most * 6 / 15).max(1) * tile);
+        }
+        assert_eq!((bounded.touched(), bounded.packings() == 0), (6, most >= 15));
+        assert!(bounded.clone().into_part() == whole);
+        for kept in [Aovs::NONE, [Aov::Position].into_iter().collect(), beside().aovs] {
+            let (mut whole, mut bounded) = (whole.clone(), bounded.clone());
+            whole.keep_aovs(kept);
+            bounded.keep_aovs(kept);
+            assert!(bounded.clone().into_part() == whole);
+            // what comes later is packed beside what was packed with all
+            for &(pixel, sample, value) in &light[..500] {
+                bounded.add(pixel, sample, value);
+                whole.add(pixel, sample, value);
+            }
+            for size in [1, 4, 1000] {
+                let (mut sum, mut bands) = (FilmPart::new(whole.layout()), Vec::new());
+                let mut channels: Vec<Vec<f32>> = kept.channels().map(|_| vec![f32::NAN; 70 * 45]).collect();
+                let each = |band: u32, bytes: Vec<u8>| {
+                    bands.push(band);
+                    let part = FilmPart::decode(&bytes, whole.layout())?;
+                    assert!((0..6).all(|tile| !part.holds(tile) || tile as u32 / size == band));
+                    for tile in (band * size..6).take(size as usize) {
+                        part.channels_of_tile(tile, 16, [1.0; 3], |x, y, channel, value| {
+                            channels[channel][(y * SIZE[0] + x) as usize] = value;
+                        });
+                    }
+                    sum.add_encoded(&bytes, 0..6)
+                };
+                bounded.clone().into_bands(size, each).unwrap();
+                assert!(sum == whole);
+                assert_eq!(bands, (0..6u32.div_ceil(size)).collect::<Vec<_>>());
+                let expected = whole.channels(16, [1.0; 3]);
+                assert!(channels.iter().zip(&expected).all(|(found, expected)| *found == expected.values));
+            }
+        }
+    }
+    // tiles without light, and light without these
+    let mut few = BoundedFilm::new(beside(), 1);
+    few.add_aov(Aov::Cost, 3, 0, &[1.0]);
+    few.add(40, 0, [1.0; 3]);
+    few.add_aov(Aov::Cost, SIZE[0] * 40, 0, &[2.0]);
+    few.add_aov(Aov::Cost, 5, 0, &[4.0]);
+    assert_eq!((few.touched(), few.packings()), (1, 3));
+    few.touch_all();
+    let part = few.into_part();
+    assert!(part.tiles.iter().all(Option::is_some) && part.planes.tiles.iter().all(Option::is_some));
+    let cost = &part.channels(1, [0.0; 3])[7];
+    assert_eq!((cost.name, cost.values[3], cost.values[5], cost.values[70 * 40]), ("cost.Y", 1.0, 4.0, 2.0));
+    assert_eq!(cost.values.iter().sum::<f32>(), 7.0);
+}
+
+/// Some tiles of a part with AOVs can be had without the others.
+#[test]
+fn tiles_with_aovs_are_read_alone() {
+    let mut whole = filled_beside(&random_aovs(22, 3000));
+    random_adds(23, 50).iter().for_each(|&(pixel, sample, value)| whole.add(pixel, sample, value));
+    let bytes = whole.encode();
+    assert_eq!(FilmPart::check(&bytes, beside()), Ok(()));
+    assert!(matches!(FilmPart::check(&bytes, SIZE), Err(FilmError::Aovs { .. })));
+    let mut sum = FilmPart::new(beside());
+    for range in [4..6, 0..1, 1..4] {
+        sum.add_encoded(&bytes, range.clone()).unwrap();
+        for tile in range.start as usize..range.end as usize {
+            assert!(sum.tiles[tile] == whole.tiles[tile] && sum.planes.get(tile) == whole.planes.get(tile));
+        }
+    }
+    assert!(sum == whole);
+    for n in (0..bytes.len()).step_by(501) {
+        assert!(sum.add_encoded(&bytes[..n], 0..6).is_err());
+    }
+    assert!(sum.add_encoded(&filled(&random_adds(24, 10)).encode(), 0..6).is_err());
+    assert!(sum == whole);
+}
+
+#[test]
+fn films_of_other_aovs_do_not_add_up() {
+    let (mut film, plain) = (filled_beside(&random_aovs(14, 100)), filled(&random_adds(15, 100)));
+    assert!(matches!(film.merge(&plain), Err(FilmError::Aovs { .. })));
+    assert!(matches!(FilmPart::decode(&plain.encode(), beside()), Err(FilmError::Aovs { .. })));
+    let error = FilmPart::decode(&film.encode(), SIZE).unwrap_err().to_string();
+    assert!(error.contains("normal, position, objectId, cost; expected: none"), "{error}");
+    film.add_aov(Aov::Normal, 3, 4, &[0.0, f32::NAN, 0.0]);
+    film.add_aov(Aov::Cost, 2, 4, &[-LIMIT]);
+    assert_eq!(film.rejected().keys.iter().copied().collect::<Vec<_>>(), [(2, 4), (3, 4)]);
+    // the variance has no sums: such a film is as large as one without
+    let variance = Layout { size: SIZE, aovs: Aovs::from_iter([Aov::Variance]) };
+    let mut film = FilmPart::new(variance);
+    assert!(film.is_empty() && film.memory() == FilmPart::new(SIZE).memory());
+    film.touch_all();
+    assert_eq!(FilmPart::decode(&film.encode(), variance).unwrap(), film);
+}
+
+#[test]
+fn bad_bytes_with_aovs_are_refused() {
+    let mut film = filled_beside(&random_aovs(16, 300));
+    random_adds(17, 30).iter().for_each(|&(pixel, sample, value)| film.add(pixel, sample, value));
+    let good = film.encode();
+    for n in (0..good.len()).step_by(7) {
+        assert!(FilmPart::decode(&good[..n], beside()).is_err());
+    }
+    let mut refused = 0;
+    let rounds = mutation::rounds("film with AOVs", 2000, |random| {
+        match FilmPart::decode(&mutation::bytes(&good, random), beside()) {
+            Ok(film) => assert_eq!(film.layout(), beside()),
+            Err(_) => refused += 1,
+        }
+    });
+    assert!(rounds.is_none_or(|n| refused > n / 6 && refused < n), "{refused} of {rounds:?}");
+}
+
+/// The variance against that of pictures of other numbers.
+#[test]
+fn variance_is_that_of_the_picture() {
+    let (size, n) = ([64, 64], 8);
+    let layout = Layout { size, aovs: Aovs::from_iter([Aov::Variance]) };
+    let mut rng = Rng(18);
+    let (mut estimate, mut truth) = (0.0, 0.0);
+    let mut film = FilmPart::new(layout);
+    for pixel in 0..size[0] * size[1] {
+        let mut sum = 0.0;
+        for sample in 0..n {
+            let x = 0.5 + 0.5 * rng.f32();
+            film.add(pixel, sample, [x, 0.0, x]);
+            sum += f64::from(x);
+        }
+        truth += (sum / f64::from(n) - 0.75).powi(2);
+    }
+    let channels = film.channels(n, [0.0; 3]);
+    assert_eq!(channels.iter().map(|c| c.name).collect::<Vec<_>>(), ["variance.R", "variance.G", "variance.B"]);
+    estimate += channels[0].values.iter().map(|&x| f64::from(x)).sum::<f64>();
+    assert!((estimate / truth - 1.0).abs() < 0.1, "{estimate} {truth}");
+    assert!(channels[1].values.iter().all(|&x| x == 0.0));
+    // one sample tells nothing of it
+    assert!(film.channels(1, [0.0; 3])[0].values.iter().all(|&x| x == f32::INFINITY));
 }

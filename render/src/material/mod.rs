@@ -222,6 +222,24 @@ impl Bsdf {
         }
     }
 
+    /// One colour for all of it, as denoisers want it, in [0, 1]: of the diffuse part, or of the base under a coat; of metal what it reflects head-on;
+    /// of glass the factor on what passes.
+    pub fn color(&self) -> Vec3 {
+        match self {
+            Bsdf::Diffuse { reflectance: color }
+            | Bsdf::Plastic { diffuse: color, .. }
+            | Bsdf::RoughPlastic { diffuse: color, .. }
+            | Bsdf::Phong { diffuse: color, .. }
+            | Bsdf::Principled(Principled { base_color: color, .. })
+            | Bsdf::Dielectric { transmit: color, .. }
+            | Bsdf::ThinDielectric { transmit: color, .. }
+            | Bsdf::RoughDielectric { transmit: color, .. } => Vec3::from(*color),
+            Bsdf::Conductor { eta, k, specular } | Bsdf::RoughConductor { eta, k, specular, .. } => {
+                conductor::fresnel(1.0, eta, k, specular)
+            }
+        }
+    }
+
     /// Whether the frame's tangents matter.
     #[inline(always)]
     pub fn is_anisotropic(&self) -> bool {

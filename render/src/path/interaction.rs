@@ -106,6 +106,11 @@ impl Interaction {
         Some(Interaction { position, front, normal, shading, from_front })
     }
 
+    /// The point.
+    pub(super) fn point(&self) -> Vec3 {
+        self.position.p
+    }
+
     /// Whether shading and geometric normal are one.
     #[inline(always)]
     pub(super) fn is_flat(&self) -> bool {

@@ -5,6 +5,8 @@
 //! in nor its neighbours matter.
 
 #[cfg(not(feature = "double"))]
+mod aov;
+#[cfg(not(feature = "double"))]
 mod block;
 mod diffuse;
 mod interaction;
@@ -30,6 +32,8 @@ use crate::skip::{Skip, SkipCounts, Skips};
 use crate::texture::{NoTextures, Textures};
 use crate::world::{Primitive, World};
 
+#[cfg(not(feature = "double"))]
+pub use aov::take_aovs;
 #[cfg(not(feature = "double"))]
 pub use primary::camera_rays;
 #[cfg(feature = "double")]

@@ -1,6 +1,6 @@
 //! A frame rendered plainly, one path at a time: for tests and for checking the real thing.
 
-use super::{Context, Counters, Outcome, Surfaces, camera_ray, shade};
+use super::{Context, Counters, Outcome, Surfaces, camera_ray, shade, take_aovs};
 use crate::film::FilmPart;
 use crate::ray::{Hit, Ray};
 
@@ -28,6 +28,9 @@ pub fn render<T: Tracer>(
             while let Some(ray) = stack.pop() {
                 let hit = tracer.closest(&ray.ray());
                 shade(context, tracer, &[ray], &[hit], &mut out);
+                take_aovs(context, tracer, &[ray], &[hit], &out.shadow, film.aovs(), |aov, pixel, sample, values| {
+                    film.add_aov(aov, pixel, sample, values);
+                });
                 for light in &out.light {
                     film.add(light.pixel, light.sample, light.value);
                 }

@@ -162,7 +162,7 @@ fn looks_up(context: &Context) -> bool {
 /// Whether a ray stands for what its sample comes upon first: the camera ray that siblings share, or the first of theirs where they do
 /// not; and every other ray.
 #[inline(always)]
-fn is_first(context: &Context, ray: &PathRay) -> bool {
+pub(super) fn is_first(context: &Context, ray: &PathRay) -> bool {
     (ray.key.vertex != 0) | (ray.key.branch == 0) | context.skips.makes(Skip::Merged)
 }
 
@@ -251,7 +251,7 @@ fn arrive<'a, S: Surfaces>(
 
 /// Whether a ray is the camera's and must not see what emits light.
 #[inline(always)]
-fn hidden(context: &Context, ray: &PathRay) -> bool {
+pub(super) fn hidden(context: &Context, ray: &PathRay) -> bool {
     context.frame.hide_emitters && ray.key.vertex == 0
 }
 
@@ -467,7 +467,7 @@ pub(super) fn scatter_plain(
 /// What a material with detail is at a hit: which material is met, on this side and of those that are blended, its model (`None`: the material's
 /// own) and opacity. Turns the shading normal of `at`, and leaves in `number` what is as random after choosing.
 #[inline(never)]
-fn appearance<'a>(
+pub(super) fn appearance<'a>(
     context: &Context<'a>,
     material: &'a Material,
     surface: &Surface,

@@ -6,6 +6,7 @@ pub(crate) mod tests;
 
 use std::collections::BTreeSet;
 
+use rayherd_render::aov::Aovs;
 use rayherd_render::filter::Filter;
 use rayherd_render::ray::PrimId;
 use serde::{Deserialize, Serialize};
@@ -124,6 +125,9 @@ pub struct Defaults {
     pub rr_depth: Option<u32>,
     /// As in [`Description::hide_emitters`].
     pub hide_emitters: bool,
+    /// As in [`Description::aovs`].
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub aovs: Option<Aovs>,
     /// Stand-ins that were made on request.
     pub substitutions: Vec<Substitution>,
 }
@@ -139,6 +143,7 @@ impl Defaults {
             max_depth: description.max_depth,
             rr_depth: description.rr_depth,
             hide_emitters: description.hide_emitters,
+            aovs: description.aovs,
             substitutions: description.substitutions.clone(),
         }
     }

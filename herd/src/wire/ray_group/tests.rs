@@ -1,5 +1,6 @@
 use proptest::prelude::*;
 use proptest::strategy::ValueTree;
+use rayherd_render::aov::Aovs;
 use rayherd_render::camera::Camera;
 use rayherd_render::filter::Filter;
 use rayherd_render::light::Lights;
@@ -24,6 +25,7 @@ fn frame() -> Frame {
         rr_depth: 5,
         split: 1,
         hide_emitters: false,
+        aovs: Aovs::NONE,
     }
 }
 

@@ -6,6 +6,7 @@ use std::sync::Arc;
 
 use glam::Vec3;
 
+use crate::aov::Aovs;
 use crate::camera::Camera;
 use crate::filter::Filter;
 use crate::frame::Frame;
@@ -234,6 +235,7 @@ pub fn frame(eye: [f64; 3], fov: f64, size: [u32; 2], max_depth: u32) -> Frame {
         rr_depth: 1000,
         split: 1,
         hide_emitters: false,
+        aovs: Aovs::NONE,
     }
 }
 

@@ -3,6 +3,7 @@
 use glam::{DAffine3, DVec3};
 
 use super::brute::Scene;
+use crate::aov::Aovs;
 use crate::camera::Camera;
 use crate::film::FilmPart;
 use crate::filter::Filter;
@@ -67,6 +68,7 @@ pub fn frame(size: u32) -> Frame {
         rr_depth: 5,
         split: 1,
         hide_emitters: false,
+        aovs: Aovs::NONE,
     }
 }
 

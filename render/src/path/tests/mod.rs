@@ -1,5 +1,6 @@
 //! Tests of light transport: closed forms, and a plain intersector to trace with.
 
+mod aovs;
 mod brute;
 mod cornell;
 mod direct;

@@ -6,7 +6,8 @@
 //! Rules where Rayherd reads a file differently from Mitsuba:
 //! - An integrator says how an image is computed, not what is in it: every integrator that estimates the full light transport
 //!   (`path`, `volpath`, `bdpt`, `path_guiding_integrator`, ...) stands for our path tracer with its `max_depth` and
-//!   `rr_depth`; `direct` is a path of depth 2. Others (`ao`, `depth`, `aov`, ...) are unsupported.
+//!   `rr_depth`; `direct` is a path of depth 2. `aov` adds layers to what the integrator inside of it makes. Others (`ao`, `depth`, ...) are
+//!   unsupported.
 //! - The sampler's kind is ignored, its `sample_count` is used.
 //! - Clip planes and focus distance of a perspective sensor are ignored: nothing is clipped.
 //! - A scene without a sensor is framed by the rule for bare meshes ([`super::framing`]).

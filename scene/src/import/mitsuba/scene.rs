@@ -1,8 +1,11 @@
 //! The root: its children in source order, and the integrator.
 
 use super::Converter;
+use rayherd_render::aov::{Aov, Aovs};
+
 use super::xml::malformed;
 use crate::ImportError;
+use crate::description::Note;
 
 /// Integrators that estimate the full light transport: the same image as path tracing.
 const FULL_TRANSPORT: &[&str] = &[
@@ -24,6 +27,16 @@ const FULL_TRANSPORT: &[&str] = &[
     "path_guiding_integrator",
     "path_tracing_integrator_py",
     "guided_path",
+];
+
+/// What Mitsuba's `aov` integrator calls what we have.
+const AOVS: &[(&str, Aov)] = &[
+    ("albedo", Aov::Albedo),
+    ("sh_normal", Aov::Normal),
+    ("depth", Aov::Depth),
+    ("position", Aov::Position),
+    ("uv", Aov::Uv),
+    ("shape_index", Aov::ObjectId),
 ];
 
 impl Converter<'_> {
@@ -61,6 +74,9 @@ impl Converter<'_> {
     fn integrator(&mut self, id: usize) -> Result<(), ImportError> {
         let object = &self.document.objects[id];
         let place = &object.place;
+        if object.plugin == "aov" {
+            return self.aov_integrator(id);
+        }
         self.out.max_depth = match self.integer(id, "max_depth")? {
             None | Some(-1) => None,
             Some(n) => match u32::try_from(n) {
@@ -96,6 +112,40 @@ impl Converter<'_> {
         }
         self.ignore(id, &["strict_normals", "samples_per_pass", "block_size", "timeout"]);
         self.out.hide_emitters = self.boolean(id, "hide_emitters")?.unwrap_or(false);
+        self.leave(id);
+        Ok(())
+    }
+
+    /// AOVs around an integrator that says how the light is found.
+    fn aov_integrator(&mut self, id: usize) -> Result<(), ImportError> {
+        let place = self.document.objects[id].place.clone();
+        let mut aovs = Vec::new();
+        if let Some((text, place)) = self.string(id, "aovs")? {
+            for item in text.split(',').map(str::trim).filter(|item| !item.is_empty()) {
+                let Some((_, kind)) = item.split_once(':') else {
+                    return malformed(place, format!("{item:?} should be NAME:KIND, such as dd.y:depth"));
+                };
+                match AOVS.iter().find(|(name, _)| *name == kind.trim()) {
+                    Some(&(_, aov)) => aovs.push(aov),
+                    None => self.unsupported(place, format!("AOV \"{}\"", super::shorten(kind.trim())), "nothing"),
+                }
+            }
+        }
+        let aovs: Aovs = aovs.into_iter().collect();
+        self.out.aovs = Some(aovs);
+        let text = format!("AOVs are layers of the EXR, and have names of their own: {aovs}");
+        self.out.notes.push(Note { place, text });
+        let mut inner = self.nested(id, "integrator")?.into_iter();
+        if let Some((property, nested)) = inner.next() {
+            match self.document.objects[nested].plugin.as_str() {
+                // also where it refers to itself
+                "aov" => self.unsupported(&property.place, "integrator \"aov\" in integrator \"aov\"", "nothing"),
+                _ => self.integrator(nested)?,
+            }
+        }
+        for (property, _) in inner {
+            self.unsupported(&property.place, "another integrator in integrator \"aov\"", "nothing");
+        }
         self.leave(id);
         Ok(())
     }

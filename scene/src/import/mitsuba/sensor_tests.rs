@@ -63,3 +63,27 @@ fn emitters_can_be_hidden() {
     assert!(!hide("") && !hide("<boolean name=\"hideEmitters\" value=\"false\"/>"));
     assert!(hide("<boolean name=\"hide_emitters\" value=\"true\"/>"));
 }
+
+#[test]
+fn aovs_are_read_around_an_integrator() {
+    use rayherd_render::aov::{Aov, Aovs};
+    let around = |aovs: &str, inside: &str| {
+        format!("{CUBE}<integrator type=\"aov\"><string name=\"aovs\" value=\"{aovs}\"/>{inside}</integrator>")
+    };
+    let path = "<integrator type=\"path\" name=\"img\"><integer name=\"max_depth\" value=\"3\"/></integrator>";
+    let read = scene(&around("dd.y:depth,nn:sh_normal, a:albedo,,p:position,t:uv,s:shape_index", path)).unwrap();
+    let all = [Aov::Albedo, Aov::Normal, Aov::Depth, Aov::Position, Aov::Uv, Aov::ObjectId];
+    assert_eq!((read.aovs, read.max_depth), (Some(all.into_iter().collect()), Some(3)));
+    assert!(read.notes.iter().any(|n| n.text.contains("albedo, normal, depth")), "{:?}", read.notes);
+    assert_eq!(scene(&around("", path)).unwrap().aovs, Some(Aovs::NONE));
+    assert_eq!(scene(&format!("{CUBE}{path}")).unwrap().aovs, None);
+    assert!(message(&around("depth", path)).contains("should be NAME:KIND"));
+    for (text, what) in [
+        (around("x:prim_index", path), "AOV \"prim_index\""),
+        (around("x:depth", &format!("{path}{path}")), "another integrator"),
+        (around("x:depth", "<integrator type=\"aov\"/>"), "integrator \"aov\" in integrator \"aov\""),
+        (around("x:depth", "<integer name=\"max_depth\" value=\"3\"/>"), "property \"max_depth\""),
+    ] {
+        assert!(message(&text).contains(what), "{}", message(&text));
+    }
+}
