@@ -7,6 +7,7 @@ mod conductor;
 mod detail;
 mod dielectric;
 mod diffuse;
+mod gloss;
 mod phong;
 mod plastic;
 mod principled;
@@ -17,6 +18,7 @@ mod tests;
 use serde::{Deserialize, Serialize};
 
 pub use detail::{Amount, Blend, Detail, Relief, ReliefKind, Slot, Textured};
+pub(crate) use gloss::{Coat, Look, Metal};
 pub use plastic::Transmittance;
 pub use principled::Principled;
 
@@ -179,6 +181,14 @@ pub struct Scatter {
 impl Scatter {
     /// No scattering.
     pub const NONE: Scatter = Scatter { value: Vec3::ZERO, pdf: 0.0 };
+
+    /// None but where `yes`: selects, no branch.
+    #[inline(always)]
+    fn only(self, yes: bool) -> Scatter {
+        let pick = |x: f32| if yes { x } else { 0.0 };
+        let Scatter { value, pdf } = self;
+        Scatter { value: Vec3::new(pick(value.x), pick(value.y), pick(value.z)), pdf: pick(pdf) }
+    }
 }
 
 /// A direction sampled from a BSDF.

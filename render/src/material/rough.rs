@@ -21,39 +21,48 @@ pub(super) struct Rough {
 }
 
 impl Rough {
-    #[inline]
+    #[inline(always)]
     pub(super) fn new(distribution: Distribution, alpha: [f32; 2]) -> Rough {
         Rough { distribution, ax: alpha[0].max(LEAST), ay: alpha[1].max(LEAST) }
     }
 
+    // of GGX without branches: blocks of vertices (`path::block`) are compiled from these
+    #[inline(always)]
     pub(super) fn eval(&self, wo: Vec3, wi: Vec3, fresnel: impl Fn(f32) -> Vec3) -> Scatter {
-        if !(wo.z > 0.0 && wi.z > 0.0) {
-            return Scatter::NONE;
-        }
         let sum = wo + wi;
         let length = sum.length();
         let m = sum / length;
         let cos_m = wo.dot(m);
-        if !(length > 0.0 && cos_m > 0.0) {
-            return Scatter::NONE;
-        }
+        let counts = (wo.z > 0.0) & (wi.z > 0.0) & (length > 0.0) & (cos_m > 0.0);
         let go = self.masking(wo);
         // D G1(wo) / (4 cos wo): the Jacobian of the reflection takes the cosine of the visible normals away
         let pdf = self.density(m) * go / (4.0 * wo.z);
-        Scatter { value: fresnel(cos_m) * (pdf * self.masking(wi)), pdf }
+        Scatter { value: fresnel(cos_m) * (pdf * self.masking(wi)), pdf }.only(counts)
     }
 
+    #[inline(always)]
     pub(super) fn sample(&self, wo: Vec3, u: [f32; 2]) -> Option<Vec3> {
-        let m = self.visible_normal(wo, u)?;
+        let (wi, counts) = self.sample_or_not(wo, u);
+        counts.then_some(wi)
+    }
+
+    /// The direction, and whether it is one.
+    #[inline(always)]
+    pub(super) fn sample_or_not(&self, wo: Vec3, u: [f32; 2]) -> (Vec3, bool) {
+        let (m, counts) = self.visible_or_not(wo, u);
         let wi = m * (2.0 * wo.dot(m)) - wo;
-        (wi.z > 0.0).then(|| wi / wi.length())
+        (wi / wi.length(), counts & (wi.z > 0.0))
     }
 
     /// A microfacet normal of unit length, of density `density(m) masking(wo) (wo . m) / wo.z` in solid angle.
     pub(super) fn visible_normal(&self, wo: Vec3, u: [f32; 2]) -> Option<Vec3> {
-        if !(wo.z > 0.0) {
-            return None;
-        }
+        let (m, counts) = self.visible_or_not(wo, u);
+        counts.then_some(m)
+    }
+
+    /// The normal, and whether it is one.
+    #[inline(always)]
+    fn visible_or_not(&self, wo: Vec3, u: [f32; 2]) -> (Vec3, bool) {
         // to the configuration of roughness 1
         let w = Vec3::new(self.ax * wo.x, self.ay * wo.y, wo.z);
         let w = w / w.length();
@@ -64,18 +73,16 @@ impl Rough {
         // and back
         let m = Vec3::new(self.ax * m.x, self.ay * m.y, m.z.max(0.0));
         let length = m.length();
-        (length > 0.0).then(|| m / length)
+        (m / length, (wo.z > 0.0) & (length > 0.0))
     }
 
     /// D(m).
+    #[inline(always)]
     pub(super) fn density(&self, m: Vec3) -> f32 {
-        if !(m.z > 0.0) {
-            return 0.0;
-        }
         let (x, y) = (m.x / self.ax, m.y / self.ay);
         let slope2 = x * x + y * y;
         let norm = PI * self.ax * self.ay;
-        match self.distribution {
+        let density = match self.distribution {
             Distribution::Ggx => {
                 let t = slope2 + m.z * m.z;
                 1.0 / (norm * t * t)
@@ -86,32 +93,29 @@ impl Rough {
                 let e = exp(-slope2 / z2);
                 if e > 0.0 { e / (norm * z4) } else { 0.0 }
             }
-        }
+        };
+        if m.z > 0.0 { density } else { 0.0 }
     }
 
     /// Smith's G1(w) = 1 / (1 + Lambda(w)), for normals on the side of `w`; of `w` below the surface that of its mirror image.
+    #[inline(always)]
     pub(super) fn masking(&self, w: Vec3) -> f32 {
         let (x, y) = (self.ax * w.x, self.ay * w.y);
         let tan2 = (x * x + y * y) / (w.z * w.z);
-        if !(tan2 > 0.0) {
-            return 1.0;
-        }
-        match self.distribution {
+        let masking = match self.distribution {
             Distribution::Ggx => 2.0 / (1.0 + (1.0 + tan2).sqrt()),
             Distribution::Beckmann => {
                 let a = 1.0 / tan2.sqrt();
                 // Lambda is below 1e-9 from a = 4 on
-                if a >= 4.0 {
-                    return 1.0;
-                }
-                let e = exp(-a * a);
-                2.0 / (1.0 + erf(a) + e / (a * PI.sqrt()))
+                if a < 4.0 { 2.0 / (1.0 + erf(a) + exp(-a * a) / (a * PI.sqrt())) } else { 1.0 }
             }
-        }
+        };
+        if tan2 > 0.0 { masking } else { 1.0 }
     }
 }
 
 /// Visible normal of GGX of roughness 1 (Dupuy and Benyoub 2023, "Sampling Visible GGX Normals with Spherical Caps").
+#[inline(always)]
 fn visible_ggx(w: Vec3, u: [f32; 2]) -> Vec3 {
     let (s, c) = sincos_turn(u[1]);
     let z = (1.0 - u[0]) * (1.0 + w.z) - w.z;
@@ -121,6 +125,7 @@ fn visible_ggx(w: Vec3, u: [f32; 2]) -> Vec3 {
 
 /// Visible normal of Beckmann of roughness 1: slopes along the projection of `w` by inversion of their distribution function, across it
 /// normally distributed (Heitz and d'Eon 2014; the parametrisation by erf is Jakob's, 2014).
+#[inline(never)]
 fn visible_beckmann(w: Vec3, u: [f32; 2]) -> Vec3 {
     let sin2 = w.x * w.x + w.y * w.y;
     let across = slope_quantile(u[1]);

@@ -1,4 +1,4 @@
-//! Many vertices at once: flat diffuse triangles, which most vertices are, in arrays that the compiler turns into vector code.
+//! Many vertices at once: triangles that are diffuse, or have one isotropic GGX lobe, in arrays that the compiler turns into vector code.
 //!
 //! Vertices are collected in the order of their rays, up to [`N`]; then each phase runs over all of them. What a phase does to one vertex is
 //! the same inlined code that the plain way runs (`shade::scatter_plain`), so the bits are the same, and a test compares them. Other
@@ -6,13 +6,16 @@
 
 use glam::Vec3;
 
-use super::diffuse::{Fate, cosine_direction, onwards, snap, towards_light};
-use super::interaction::Flat;
+use super::diffuse::{
+    Fate, cosine_direction, onwards, scattered_light, scattered_onwards, select, snap, towards_light,
+};
+use super::interaction::{Flat, smooth};
 use super::{Context, Outcome, PathRay, ShadowRay, wide};
-use crate::light::{Choice, Few, FewTriangles, Node, TriangleLight, end, probability};
-use crate::math::{UnitDir, offset_origin, unit};
+use crate::light::{Choice, Few, FewTriangles, LightSample, Node, TriangleLight, end, probability};
+use crate::material::{Coat, Look, Metal, Scatter};
+use crate::math::{Basis, UnitDir, offset_origin, unit};
 use crate::ray::{PathKey, Ray};
-use crate::sampler::{BSDF, LIGHT, LIGHT_CHOICE, ROULETTE, Streams};
+use crate::sampler::{BSDF, LIGHT, LIGHT_CHOICE, LOBE, ROULETTE, Streams};
 use crate::skip::Skip;
 
 /// Vertices of a block.
@@ -39,15 +42,26 @@ impl Lanes3 {
     }
 }
 
-/// A hit of a diffuse triangle without shading normals.
+/// A hit of a triangle that a block takes.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct FlatDiffuse {
+pub(super) struct Opaque {
     pub vertices: [[f32; 3]; 3],
+    pub normals: Option<[[f32; 3]; 3]>,
     pub u: f32,
     pub v: f32,
     pub d: [f32; 3],
-    pub reflectance: [f32; 3],
+    pub look: Look,
     pub two_sided: bool,
+    /// Number of its shape, where the look is no diffuse one.
+    pub shape: u32,
+}
+
+/// What some vertex of a block has that not all have.
+#[derive(Clone, Copy, Debug, Default)]
+struct Kinds {
+    smooth: bool,
+    coat: bool,
+    metal: bool,
 }
 
 /// Vertices by component. Lanes beyond `len`, and of vertices that pass through, hold what was there before: computed with, never read.
@@ -66,9 +80,30 @@ pub(super) struct Block {
     u: Lanes,
     v: Lanes,
     d: Lanes3,
+    /// Albedo, also of a coat's base.
     reflectance: Lanes3,
+    kinds: Kinds,
+    // of shading normals, where there are any
+    is_smooth: [bool; N],
+    n0: Lanes3,
+    n1: Lanes3,
+    n2: Lanes3,
+    // of lobes, where there are any
+    is_coat: [bool; N],
+    is_metal: [bool; N],
+    shape: [u32; N],
+    alpha: Lanes,
+    specular: Lanes3,
+    eta: Lanes3,
+    k: Lanes3,
+    nonlinear: [bool; N],
+    internal: Lanes,
+    entering: Lanes,
+    leaving: Lanes,
+    lobe: Lanes,
     // of the geometry
     normal: Lanes3,
+    shading: Lanes3,
     origin: Lanes3,
     seen: [bool; N],
     // numbers
@@ -152,7 +187,25 @@ impl Default for Block {
             v: lanes,
             d: Lanes3::ZERO,
             reflectance: Lanes3::ZERO,
+            kinds: Kinds::default(),
+            is_smooth: [false; N],
+            n0: Lanes3::ZERO,
+            n1: Lanes3::ZERO,
+            n2: Lanes3::ZERO,
+            is_coat: [false; N],
+            is_metal: [false; N],
+            shape: [0; N],
+            alpha: lanes,
+            specular: Lanes3::ZERO,
+            eta: Lanes3::ZERO,
+            k: Lanes3::ZERO,
+            nonlinear: [false; N],
+            internal: lanes,
+            entering: lanes,
+            leaving: lanes,
+            lobe: lanes,
             normal: Lanes3::ZERO,
+            shading: Lanes3::ZERO,
             origin: Lanes3::ZERO,
             seen: [false; N],
             direction: [lanes; 2],
@@ -191,28 +244,61 @@ impl Default for Block {
 }
 
 impl Block {
-    /// Adds a vertex of the ray at `index` of the batch, with a sibling's key and throughput, and its surface if it is a flat diffuse triangle;
-    /// true when the block is full and must be flushed.
+    /// Adds a vertex of the ray at `index` of the batch, with a sibling's key and throughput, and its surface if a block takes it; true when the
+    /// block is full and must be flushed.
     #[inline(always)]
-    pub(super) fn push(&mut self, index: u32, key: PathKey, throughput: Vec3, flat: Option<&FlatDiffuse>) -> bool {
+    pub(super) fn push(&mut self, index: u32, key: PathKey, throughput: Vec3, hit: Option<&Opaque>) -> bool {
         // the mask changes nothing, and tells the compiler that there is a place
         let i = self.len & (N - 1);
         self.index[i] = index;
         self.key[i] = key;
         self.throughput.set(i, throughput);
-        self.passes[i] = flat.is_none();
-        if let Some(flat) = flat {
-            self.p0.set(i, flat.vertices[0].into());
-            self.p1.set(i, flat.vertices[1].into());
-            self.p2.set(i, flat.vertices[2].into());
-            self.u[i] = flat.u;
-            self.v[i] = flat.v;
-            self.d.set(i, flat.d.into());
-            self.reflectance.set(i, flat.reflectance.into());
-            self.two_sided[i] = flat.two_sided;
+        self.passes[i] = hit.is_none();
+        (self.is_smooth[i], self.is_coat[i], self.is_metal[i]) = (false, false, false);
+        if let Some(hit) = hit {
+            self.p0.set(i, hit.vertices[0].into());
+            self.p1.set(i, hit.vertices[1].into());
+            self.p2.set(i, hit.vertices[2].into());
+            self.u[i] = hit.u;
+            self.v[i] = hit.v;
+            self.d.set(i, hit.d.into());
+            self.two_sided[i] = hit.two_sided;
+            match &hit.look {
+                Look::Diffuse(reflectance) => self.reflectance.set(i, (*reflectance).into()),
+                lobe => self.push_lobe(i, lobe, hit.shape),
+            }
+            if let Some([n0, n1, n2]) = hit.normals {
+                (self.is_smooth[i], self.kinds.smooth) = (true, true);
+                self.n0.set(i, n0.into());
+                self.n1.set(i, n1.into());
+                self.n2.set(i, n2.into());
+            }
         }
         self.len += 1;
         self.len == N
+    }
+
+    fn push_lobe(&mut self, i: usize, look: &Look, shape: u32) {
+        match look {
+            Look::Diffuse(_) => {}
+            Look::Coat(coat) => {
+                (self.is_coat[i], self.kinds.coat) = (true, true);
+                self.shape[i] = shape;
+                self.alpha[i] = coat.alpha;
+                self.eta.0[0][i] = coat.eta;
+                self.reflectance.set(i, coat.diffuse.into());
+                self.specular.set(i, coat.specular.into());
+                self.nonlinear[i] = coat.nonlinear;
+                self.internal[i] = coat.internal;
+            }
+            Look::Metal(metal) => {
+                (self.is_metal[i], self.kinds.metal) = (true, true);
+                self.alpha[i] = metal.alpha;
+                self.eta.set(i, metal.eta.into());
+                self.k.set(i, metal.k.into());
+                self.specular.set(i, metal.specular.into());
+            }
+        }
     }
 
     /// Scatters all vertices and appends what comes of them to `out` in order; `plain` does those that pass through, by index, key and
@@ -237,23 +323,30 @@ impl Block {
         } else {
             self.emit(out);
         }
-        self.len = 0;
+        (self.len, self.kinds) = (0, Kinds::default());
     }
 
     /// All phases but the last; inlined into each of their compilations.
     #[inline(always)]
     pub(super) fn phases(&mut self, context: &Context) {
         self.geometry();
+        if self.kinds.coat {
+            let mut cosines = [0.0; N];
+            for i in 0..N {
+                cosines[i] = self.shading.get(i).dot(-self.d.get(i));
+            }
+            self.entering = self.shares_of_coats(context, &cosines);
+        }
         self.numbers(context);
         self.choose_lights(context);
         self.sample_lights();
         self.other_lights(context);
         let skips_unlit = context.skips.makes(Skip::Shadows);
-        self.shadow_rays(!skips_unlit);
+        self.shadow_rays(context, !skips_unlit);
         if skips_unlit {
             self.count_unlit();
         }
-        self.next_rays(context.frame.split as f32);
+        self.next_rays(context);
     }
 
     #[inline(always)]
@@ -265,14 +358,23 @@ impl Block {
             self.seen[i] = flat.from_front | self.two_sided[i];
             self.passes[i] |= !flat.sound;
         }
+        self.shading = self.normal;
+        if self.kinds.smooth {
+            for i in 0..N {
+                let (normal, d) = (self.normal.get(i), self.d.get(i));
+                let normals = [self.n0.get(i), self.n1.get(i), self.n2.get(i)];
+                let shading = smooth(normals, self.u[i], self.v[i], normal, d);
+                self.shading.set(i, select(self.is_smooth[i], shading, normal));
+            }
+        }
     }
 
     #[inline(always)]
     fn numbers(&mut self, context: &Context) {
         let frame = context.frame;
         let mut streams = Streams::new(frame.seed);
-        const DIMENSIONS: [usize; 5] = [BSDF, BSDF + 1, LIGHT, LIGHT + 1, ROULETTE];
-        let mut raw = [[0; N]; 5];
+        const DIMENSIONS: [usize; 6] = [BSDF, BSDF + 1, LIGHT, LIGHT + 1, ROULETTE, LOBE];
+        let mut raw = [[0; N]; 6];
         for i in 0..self.len {
             let key = self.key[i];
             let vertex = u32::from(key.vertex) + 1;
@@ -290,6 +392,7 @@ impl Block {
         units(&mut self.place[0], &raw[2]);
         units(&mut self.place[1], &raw[3]);
         units(&mut self.go_on, &raw[4]);
+        units(&mut self.lobe, &raw[5]);
         self.place_bits = [raw[2], raw[3]];
     }
 
@@ -413,23 +516,43 @@ impl Block {
         if context.lights.few_triangles().is_some() {
             return;
         }
+        let far_sky = context.lights.has_far_sky();
+        let (mut skies, mut lanes, mut count) = ([[0; 2]; N], [0u8; N], 0);
+        let mut probability = 0.0;
         for i in 0..self.len {
             let Some(choice) = self.chosen[i] else {
                 self.lit[i] = false;
                 continue;
             };
+            if far_sky && context.lights.is_sky(choice) {
+                // all of one probability
+                probability = choice.probability;
+                (skies[count], lanes[count]) = ([self.place_bits[0][i], self.place_bits[1][i]], i as u8);
+                count += 1;
+                continue;
+            }
             if context.lights.only_triangles() || context.lights.triangle(choice).is_some() {
                 continue;
             }
             let place = [self.place_bits[0][i], self.place_bits[1][i]];
             let light = context.lights.sample_chosen(choice, self.origin.get(i), place);
-            self.lit[i] = light.is_some();
-            if let Some(light) = light {
-                self.light_d.set(i, light.d);
-                self.light_tmax[i] = light.tmax;
-                self.light_pdf[i] = light.pdf;
-                self.radiance.set(i, context.radiance(&light));
-            }
+            self.take_light(context, i, light);
+        }
+        if count > 0 {
+            context.lights.sample_skies(probability, &skies[..count], |k, light| {
+                self.take_light(context, usize::from(lanes[k]) & (N - 1), light);
+            });
+        }
+    }
+
+    #[inline(always)]
+    fn take_light(&mut self, context: &Context, i: usize, light: Option<LightSample>) {
+        self.lit[i] = light.is_some();
+        if let Some(light) = light {
+            self.light_d.set(i, light.d);
+            self.light_tmax[i] = light.tmax;
+            self.light_pdf[i] = light.pdf;
+            self.radiance.set(i, context.radiance(&light));
         }
     }
 
@@ -437,7 +560,7 @@ impl Block {
 
     /// `sends`: also where they bring nothing.
     #[inline(always)]
-    fn shadow_rays(&mut self, sends: bool) {
+    fn shadow_rays(&mut self, context: &Context, sends: bool) {
         for i in 0..N {
             let (dir, d) = snap(self.light_d.get(i));
             self.shadow_dir[i] = dir;
@@ -448,6 +571,7 @@ impl Block {
                 self.throughput.get(i),
                 self.reflectance.get(i),
                 self.normal.get(i),
+                self.shading.get(i),
                 self.light_d.get(i),
                 self.shadow_d.get(i),
                 self.light_pdf[i],
@@ -455,17 +579,119 @@ impl Block {
                 self.lit[i] & self.seen[i],
             );
             self.contribution.set(i, contribution);
+        }
+        if self.kinds.coat {
+            for i in 0..N {
+                self.leaving[i] = self.shading.get(i).dot(self.shadow_d.get(i));
+            }
+            self.leaving = self.shares_of_coats(context, &self.leaving);
+            for i in 0..N {
+                let scatter = self.coat_scatters(i, self.shadow_d.get(i));
+                let contribution = select(self.is_coat[i], self.lobe_light(i, scatter), self.contribution.get(i));
+                self.contribution.set(i, contribution);
+            }
+        }
+        if self.kinds.metal {
+            for i in 0..N {
+                let scatter = self.metal_scatters(i, self.shadow_d.get(i));
+                let contribution = select(self.is_metal[i], self.lobe_light(i, scatter), self.contribution.get(i));
+                self.contribution.set(i, contribution);
+            }
+        }
+        for i in 0..N {
+            let contribution = self.contribution.get(i);
             let brings = (contribution.x != 0.0) | (contribution.y != 0.0) | (contribution.z != 0.0);
             self.casts[i] = brings | (sends & self.lit[i] & self.seen[i]);
         }
     }
 
+    /// What passes the coats at these cosines; of a table a material, which no vector reads.
     #[inline(always)]
-    fn next_rays(&mut self, siblings: f32) {
+    fn shares_of_coats(&self, context: &Context, cosines: &Lanes) -> Lanes {
+        let world = context.world;
+        let mut out = [0.0; N];
+        for i in 0..self.len {
+            if self.is_coat[i] {
+                let material = &world.materials[world.shapes[self.shape[i] as usize].material as usize];
+                out[i] = material.coat().map_or(0.0, |coat| coat.at(cosines[i]));
+            }
+        }
+        out
+    }
+
+    /// Of a coat, towards a world direction that its light leaves by.
+    #[inline(always)]
+    fn coat_scatters(&self, i: usize, d: Vec3) -> Scatter {
+        let basis = Basis::new(self.shading.get(i));
+        let (wo, wi) = (basis.to_local(-self.d.get(i)), basis.to_local(d));
+        self.coat(i).eval(self.entering[i], self.leaving[i], wo, wi)
+    }
+
+    #[inline(always)]
+    fn metal_scatters(&self, i: usize, d: Vec3) -> Scatter {
+        let basis = Basis::new(self.shading.get(i));
+        let (wo, wi) = (basis.to_local(-self.d.get(i)), basis.to_local(d));
+        self.metal(i).eval(wo, wi)
+    }
+
+    #[inline(always)]
+    fn lobe_light(&self, i: usize, scatter: Scatter) -> Vec3 {
+        scattered_light(
+            self.throughput.get(i),
+            scatter,
+            self.normal.get(i),
+            self.shadow_d.get(i),
+            self.light_pdf[i],
+            self.radiance.get(i),
+            self.lit[i] & self.seen[i],
+        )
+    }
+
+    #[inline(always)]
+    fn coat(&self, i: usize) -> Coat {
+        Coat {
+            alpha: self.alpha[i],
+            eta: self.eta.0[0][i],
+            diffuse: [self.reflectance.0[0][i], self.reflectance.0[1][i], self.reflectance.0[2][i]],
+            specular: [self.specular.0[0][i], self.specular.0[1][i], self.specular.0[2][i]],
+            nonlinear: self.nonlinear[i],
+            internal: self.internal[i],
+        }
+    }
+
+    #[inline(always)]
+    fn metal(&self, i: usize) -> Metal {
+        Metal {
+            alpha: self.alpha[i],
+            eta: [self.eta.0[0][i], self.eta.0[1][i], self.eta.0[2][i]],
+            k: [self.k.0[0][i], self.k.0[1][i], self.k.0[2][i]],
+            specular: [self.specular.0[0][i], self.specular.0[1][i], self.specular.0[2][i]],
+        }
+    }
+
+    #[inline(always)]
+    fn next_rays(&mut self, context: &Context) {
+        let siblings = context.frame.split as f32;
         for i in 0..N {
-            let (d, above) = cosine_direction(self.normal.get(i), [self.direction[0][i], self.direction[1][i]]);
+            let (d, above) = cosine_direction(self.shading.get(i), [self.direction[0][i], self.direction[1][i]]);
             self.next_d.set(i, d);
             self.above[i] = above & self.seen[i];
+        }
+        if self.kinds.coat {
+            for i in 0..N {
+                let basis = Basis::new(self.shading.get(i));
+                let (wo, u) = (basis.to_local(-self.d.get(i)), [self.direction[0][i], self.direction[1][i]]);
+                let (wi, counts) = self.coat(i).sample(self.entering[i], wo, u, self.lobe[i]);
+                self.take_direction(i, basis.to_world(wi), counts, self.is_coat[i]);
+            }
+        }
+        if self.kinds.metal {
+            for i in 0..N {
+                let basis = Basis::new(self.shading.get(i));
+                let (wo, u) = (basis.to_local(-self.d.get(i)), [self.direction[0][i], self.direction[1][i]]);
+                let (wi, counts) = self.metal(i).sample(wo, u);
+                self.take_direction(i, basis.to_world(wi), counts, self.is_metal[i]);
+            }
         }
         for i in 0..N {
             let (dir, d) = snap(self.next_d.get(i));
@@ -477,6 +703,7 @@ impl Block {
                 self.throughput.get(i),
                 self.reflectance.get(i),
                 self.normal.get(i),
+                self.shading.get(i),
                 self.next_d.get(i),
                 self.above[i],
                 self.go_on[i],
@@ -487,6 +714,45 @@ impl Block {
             self.next_pdf[i] = pdf;
             self.fate[i] = fate;
         }
+        if self.kinds.coat {
+            for i in 0..N {
+                self.leaving[i] = self.shading.get(i).dot(self.next_d.get(i));
+            }
+            self.leaving = self.shares_of_coats(context, &self.leaving);
+            for i in 0..N {
+                let scatter = self.coat_scatters(i, self.next_d.get(i));
+                self.take_onwards(i, scatter, siblings, self.is_coat[i]);
+            }
+        }
+        if self.kinds.metal {
+            for i in 0..N {
+                let scatter = self.metal_scatters(i, self.next_d.get(i));
+                self.take_onwards(i, scatter, siblings, self.is_metal[i]);
+            }
+        }
+    }
+
+    #[inline(always)]
+    fn take_direction(&mut self, i: usize, d: Vec3, counts: bool, yes: bool) {
+        self.next_d.set(i, select(yes, d, self.next_d.get(i)));
+        self.above[i] = (yes & counts & self.seen[i]) | (!yes & self.above[i]);
+    }
+
+    #[inline(always)]
+    fn take_onwards(&mut self, i: usize, scatter: Scatter, siblings: f32, yes: bool) {
+        let (throughput, pdf, fate) = scattered_onwards(
+            self.throughput.get(i),
+            scatter,
+            self.normal.get(i),
+            self.next_d.get(i),
+            self.above[i],
+            self.go_on[i],
+            self.roulette[i],
+            siblings,
+        );
+        self.next_throughput.set(i, select(yes, throughput, self.next_throughput.get(i)));
+        self.next_pdf[i] = if yes { pdf } else { self.next_pdf[i] };
+        self.fate[i] = if yes { fate } else { self.fate[i] };
     }
 
     /// Counts the vertices without a shadow ray; those that pass are counted where they are shaded.
