@@ -4,7 +4,7 @@
 use super::detail::{Textured, scaled, share};
 use super::plastic::Coated;
 use super::rough::Rough;
-use super::{Bsdf, Distribution, Material, Scatter, Slot, Transmittance, conductor, diffuse};
+use super::{Bsdf, Detail, Distribution, Material, Scatter, Slot, Transmittance, conductor, diffuse};
 use crate::real::{Vec3, f32};
 use crate::texture::{At, Texture, Textures};
 
@@ -41,46 +41,45 @@ pub(crate) struct Metal {
 }
 
 impl Material {
-    /// Whether [`Material::look`] may say something.
+    /// Whether [`Material::look`] says something, at every place.
     #[inline(always)]
     pub(crate) fn has_look(&self) -> bool {
         let is_known = match &self.bsdf {
             Bsdf::Diffuse { .. } => true,
-            Bsdf::RoughPlastic { distribution, .. } | Bsdf::RoughConductor { distribution, .. } => {
-                *distribution == Distribution::Ggx
+            Bsdf::RoughPlastic { distribution, .. } => *distribution == Distribution::Ggx,
+            Bsdf::RoughConductor { distribution, alpha, .. } => {
+                *distribution == Distribution::Ggx && alpha[0] == alpha[1]
             }
             _ => false,
         };
-        is_known && self.detail.as_ref().is_none_or(|detail| detail.is_paint())
+        let is_paint = |detail: &Detail| {
+            let turns = |t: &Textured| matches!(t.slot, Slot::AlphaU | Slot::AlphaV);
+            detail.is_paint() && !detail.textured.iter().any(turns)
+        };
+        is_known && self.detail.as_deref().is_none_or(is_paint)
     }
 
     /// The model at a place as a block takes it; `None` where there is more to it.
-    #[inline]
-    pub(crate) fn look(&self, textures: &[Texture], tiles: &dyn Textures, at: impl FnOnce() -> At) -> Option<Look> {
+    pub(crate) fn look(&self, textures: &[Texture], tiles: &dyn Textures, at: At) -> Option<Look> {
+        if !self.has_look() {
+            return None;
+        }
         let mut look = match &self.bsdf {
             Bsdf::Diffuse { reflectance } => Look::Diffuse(*reflectance),
-            Bsdf::RoughPlastic { distribution: Distribution::Ggx, alpha, eta, diffuse, specular, nonlinear, coat } => {
-                Look::Coat(Coat {
-                    alpha: *alpha,
-                    eta: *eta,
-                    diffuse: *diffuse,
-                    specular: *specular,
-                    nonlinear: *nonlinear,
-                    internal: coat.internal,
-                })
-            }
-            Bsdf::RoughConductor { distribution: Distribution::Ggx, alpha: [alpha, other], eta, k, specular }
-                if alpha == other =>
-            {
+            Bsdf::RoughPlastic { alpha, eta, diffuse, specular, nonlinear, coat, .. } => Look::Coat(Coat {
+                alpha: *alpha,
+                eta: *eta,
+                diffuse: *diffuse,
+                specular: *specular,
+                nonlinear: *nonlinear,
+                internal: coat.internal,
+            }),
+            Bsdf::RoughConductor { alpha: [alpha, _], eta, k, specular, .. } => {
                 Look::Metal(Metal { alpha: *alpha, eta: *eta, k: *k, specular: *specular })
             }
             _ => return None,
         };
         let Some(detail) = &self.detail else { return Some(look) };
-        if !detail.is_paint() {
-            return None;
-        }
-        let at = at();
         for &Textured { slot, texture, scale } in &detail.textured {
             let texture = &textures[texture as usize];
             match (slot, &mut look) {
@@ -92,7 +91,6 @@ impl Material {
                     *color = scaled(texture.color(tiles, at), scale);
                 }
                 (Slot::Alpha, Look::Metal(metal)) => metal.alpha = share(texture.amount(tiles, at) * scale[0]),
-                (Slot::AlphaU | Slot::AlphaV, Look::Metal(_)) => return None,
                 // of no meaning for this model, as in `Material::at`
                 _ => {}
             }
@@ -143,7 +141,8 @@ impl Metal {
     /// Value and density.
     #[inline(always)]
     pub(crate) fn eval(&self, wo: Vec3, wi: Vec3) -> Scatter {
-        ggx(self.alpha).eval(wo, wi, |cos| conductor::fresnel(cos, &self.eta, &self.k, &self.specular))
+        let lobe = ggx(self.alpha).lobe(wo, wi);
+        lobe.reflecting(conductor::fresnel(lobe.cos, &self.eta, &self.k, &self.specular))
     }
 
     /// A direction, and whether it is one.

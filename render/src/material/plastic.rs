@@ -164,7 +164,8 @@ impl Coated {
     ) -> Scatter {
         let probability = self.coat_probability(1.0 - entering);
         let base = self.base(entering, leaving, internal, wi.z);
-        let lobe = rough.eval(wo, wi, |cos| Vec3::splat(fresnel(cos, self.eta).0));
+        let lobe = rough.lobe(wo, wi);
+        let lobe = lobe.reflecting(Vec3::splat(fresnel(lobe.cos, self.eta).0));
         Scatter {
             value: self.specular * lobe.value + base,
             pdf: probability * lobe.pdf + (1.0 - probability) * wi.z * FRAC_1_PI,

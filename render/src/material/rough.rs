@@ -20,15 +20,39 @@ pub(super) struct Rough {
     ay: f32,
 }
 
+/// A pair of directions, but for what the microfacet reflects.
+pub(super) struct Lobe {
+    /// At the microfacet.
+    pub cos: f32,
+    pdf: f32,
+    value: f32,
+    counts: bool,
+}
+
+impl Lobe {
+    /// Where the microfacet reflects such a share.
+    #[inline(always)]
+    pub(super) fn reflecting(&self, share: Vec3) -> Scatter {
+        Scatter { value: share * self.value, pdf: self.pdf }.only(self.counts)
+    }
+}
+
 impl Rough {
     #[inline(always)]
     pub(super) fn new(distribution: Distribution, alpha: [f32; 2]) -> Rough {
         Rough { distribution, ax: alpha[0].max(LEAST), ay: alpha[1].max(LEAST) }
     }
 
-    // of GGX without branches: blocks of vertices (`path::block`) are compiled from these
+    /// What a pair of directions reflects, by Fresnel's reflectance for the cosine at the microfacet.
     #[inline(always)]
     pub(super) fn eval(&self, wo: Vec3, wi: Vec3, fresnel: impl Fn(f32) -> Vec3) -> Scatter {
+        let lobe = self.lobe(wo, wi);
+        lobe.reflecting(fresnel(lobe.cos))
+    }
+
+    // of GGX without branches: blocks of vertices (`path::block`) are compiled from these, and not from what takes a closure, which stays a call
+    #[inline(always)]
+    pub(super) fn lobe(&self, wo: Vec3, wi: Vec3) -> Lobe {
         let sum = wo + wi;
         let length = sum.length();
         let m = sum / length;
@@ -37,7 +61,7 @@ impl Rough {
         let go = self.masking(wo);
         // D G1(wo) / (4 cos wo): the Jacobian of the reflection takes the cosine of the visible normals away
         let pdf = self.density(m) * go / (4.0 * wo.z);
-        Scatter { value: fresnel(cos_m) * (pdf * self.masking(wi)), pdf }.only(counts)
+        Lobe { cos: cos_m, pdf, value: pdf * self.masking(wi), counts }
     }
 
     #[inline(always)]

@@ -17,6 +17,7 @@ use crate::math::{Basis, UnitDir, offset_origin, unit};
 use crate::ray::{PathKey, Ray};
 use crate::sampler::{BSDF, LIGHT, LIGHT_CHOICE, LOBE, ROULETTE, Streams};
 use crate::skip::Skip;
+use crate::texture::At;
 
 /// Vertices of a block.
 pub(super) const N: usize = 32;
@@ -50,16 +51,26 @@ pub(super) struct Opaque {
     pub u: f32,
     pub v: f32,
     pub d: [f32; 3],
-    pub look: Look,
+    pub look: Appearance,
     pub two_sided: bool,
-    /// Number of its shape, where the look is no diffuse one.
+    /// Number of its shape, where the look is no even diffuse one.
     pub shape: u32,
+}
+
+/// What a hit looks like.
+#[derive(Clone, Copy, Debug)]
+pub(super) enum Appearance {
+    /// The same everywhere.
+    Even(Look),
+    /// By textures at a place, whose texels were asked for: they are read when the block is full.
+    Painted(At),
 }
 
 /// What some vertex of a block has that not all have.
 #[derive(Clone, Copy, Debug, Default)]
 struct Kinds {
     smooth: bool,
+    painted: bool,
     coat: bool,
     metal: bool,
 }
@@ -88,6 +99,9 @@ pub(super) struct Block {
     n0: Lanes3,
     n1: Lanes3,
     n2: Lanes3,
+    // of textures
+    is_painted: [bool; N],
+    at: [At; N],
     // of lobes, where there are any
     is_coat: [bool; N],
     is_metal: [bool; N],
@@ -192,6 +206,8 @@ impl Default for Block {
             n0: Lanes3::ZERO,
             n1: Lanes3::ZERO,
             n2: Lanes3::ZERO,
+            is_painted: [false; N],
+            at: [At::uv([0.0; 2]); N],
             is_coat: [false; N],
             is_metal: [false; N],
             shape: [0; N],
@@ -254,7 +270,8 @@ impl Block {
         self.key[i] = key;
         self.throughput.set(i, throughput);
         self.passes[i] = hit.is_none();
-        (self.is_smooth[i], self.is_coat[i], self.is_metal[i]) = (false, false, false);
+        (self.is_smooth[i], self.is_painted[i]) = (false, false);
+        (self.is_coat[i], self.is_metal[i]) = (false, false);
         if let Some(hit) = hit {
             self.p0.set(i, hit.vertices[0].into());
             self.p1.set(i, hit.vertices[1].into());
@@ -264,8 +281,15 @@ impl Block {
             self.d.set(i, hit.d.into());
             self.two_sided[i] = hit.two_sided;
             match &hit.look {
-                Look::Diffuse(reflectance) => self.reflectance.set(i, (*reflectance).into()),
-                lobe => self.push_lobe(i, lobe, hit.shape),
+                Appearance::Even(Look::Diffuse(reflectance)) => self.reflectance.set(i, (*reflectance).into()),
+                Appearance::Even(look) => {
+                    self.shape[i] = hit.shape;
+                    self.set_look(i, look);
+                }
+                Appearance::Painted(at) => {
+                    (self.is_painted[i], self.kinds.painted) = (true, true);
+                    (self.shape[i], self.at[i]) = (hit.shape, *at);
+                }
             }
             if let Some([n0, n1, n2]) = hit.normals {
                 (self.is_smooth[i], self.kinds.smooth) = (true, true);
@@ -278,12 +302,11 @@ impl Block {
         self.len == N
     }
 
-    fn push_lobe(&mut self, i: usize, look: &Look, shape: u32) {
+    fn set_look(&mut self, i: usize, look: &Look) {
         match look {
-            Look::Diffuse(_) => {}
+            Look::Diffuse(reflectance) => self.reflectance.set(i, (*reflectance).into()),
             Look::Coat(coat) => {
                 (self.is_coat[i], self.kinds.coat) = (true, true);
-                self.shape[i] = shape;
                 self.alpha[i] = coat.alpha;
                 self.eta.0[0][i] = coat.eta;
                 self.reflectance.set(i, coat.diffuse.into());
@@ -314,6 +337,9 @@ impl Block {
         if few {
             self.passes = [true; N];
         } else {
+            if self.kinds.painted {
+                self.paint(context);
+            }
             wide::compute(self, context);
         }
         out.counters.chosen_of_fewer += std::mem::take(&mut self.fewer);
@@ -324,6 +350,20 @@ impl Block {
             self.emit(out);
         }
         (self.len, self.kinds) = (0, Kinds::default());
+    }
+
+    /// Reads the textures.
+    fn paint(&mut self, context: &Context) {
+        let world = context.world;
+        for i in 0..self.len {
+            if self.is_painted[i] && !self.passes[i] {
+                let material = &world.materials[world.shapes[self.shape[i] as usize].material as usize];
+                match material.look(&world.textures, context.textures, self.at[i]) {
+                    Some(look) => self.set_look(i, &look),
+                    None => self.passes[i] = true,
+                }
+            }
+        }
     }
 
     /// All phases but the last; inlined into each of their compilations.

@@ -1,7 +1,7 @@
 //! Shading of a batch.
 
 #[cfg(not(feature = "double"))]
-use super::block::{Block, Opaque};
+use super::block::{Appearance, Block, Opaque};
 use super::diffuse::{Fate, cosine_direction, onwards, snap, survive, towards_light};
 use super::interaction::{Interaction, triangle_place};
 use super::{Context, Contribution, Outcome, PathRay, ShadowRay, Surface, Surfaces, power_heuristic};
@@ -47,14 +47,10 @@ pub fn shade_traced<S: Surfaces>(
     if far_sky {
         shade_missed(context, rays, traced, hits, out);
     }
-    let (is_far, has_textures) = (surfaces.is_far(), !context.world.textures.is_empty());
+    let is_far = surfaces.is_far();
     for (index, ((ray, traced), hit)) in rays.iter().zip(traced).zip(hits).enumerate() {
-        if is_far && let Some(hit) = hits.get(index + SURFACES_AHEAD).filter(|hit| hit.is_hit()) {
+        if is_far && let Some(hit) = hits.get(index + AHEAD).filter(|hit| hit.is_hit()) {
             surfaces.foresee(hit);
-        }
-        if has_textures && let (Some(ray), Some(hit)) = (rays.get(index + TEXELS_AHEAD), hits.get(index + TEXELS_AHEAD))
-        {
-            foresee_texels(context, surfaces, index + TEXELS_AHEAD, ray, hit);
         }
         if !hit.is_hit() {
             out.counters.missed += 1;
@@ -104,30 +100,9 @@ fn shade_missed(context: &Context, rays: &[PathRay], traced: &[Ray], hits: &[Hit
     bring(&indices[..count], &directions[..count]);
 }
 
-/// Hits that lie so far ahead are asked for: first their surfaces, then, when these are there, their texels. A vertex takes some 1000 cycles, memory some 300;
-/// twice as many as are needed leave room for a block that is flushed in between.
-const SURFACES_AHEAD: usize = 16;
-const TEXELS_AHEAD: usize = 8;
-
-/// Asks for the texels that shading a hit will look up; of materials within the one that is met, they come when they are needed.
-#[inline(never)]
-fn foresee_texels<S: Surfaces>(context: &Context, surfaces: &S, index: usize, ray: &PathRay, hit: &Hit) {
-    if !hit.is_hit() || u32::from(ray.key.vertex) + 1 >= context.frame.max_depth {
-        return;
-    }
-    let world = context.world;
-    let material = &world.materials[world.shapes[surfaces.shape(index, hit) as usize].material as usize];
-    let Some(detail) = &material.detail else { return };
-    let mut textures = detail.textures().peekable();
-    if textures.peek().is_none() {
-        return;
-    }
-    let surface = surfaces.surface(index, hit);
-    if let Primitive::Triangle(_) = surface.geometry {
-        let place = triangle_place(&surface, hit);
-        textures.for_each(|t| world.textures[t as usize].foresee(context.textures, place));
-    }
-}
+/// The surfaces of hits that lie so far ahead are asked for. A vertex takes some 1000 cycles one by one and 200 in a block, memory some 300: twice as
+/// many as are needed leave room for a block that is flushed in between.
+const AHEAD: usize = 16;
 
 /// The plain twin of `shade`: one vertex after the other.
 #[cfg(any(test, feature = "double"))]
@@ -213,7 +188,7 @@ fn opaque<S: Surfaces>(
     if let (Bsdf::Diffuse { reflectance }, None) = (&material.bsdf, &material.detail)
         && let Some(vertices) = surfaces.flat_triangle(index, hit)
     {
-        let look = Look::Diffuse(*reflectance);
+        let look = Appearance::Even(Look::Diffuse(*reflectance));
         let (u, v, two_sided) = (hit.u, hit.v, material.two_sided);
         return Some(Opaque { vertices, normals: None, u, v, d, look, two_sided, shape: 0 });
     }
@@ -233,7 +208,15 @@ fn opaque_surface<S: Surfaces>(
 ) -> Option<Opaque> {
     let surface = surfaces.surface(index, hit);
     let Primitive::Triangle(vertices) = surface.geometry else { return None };
-    let look = material.look(&context.world.textures, context.textures, || triangle_place(&surface, hit))?;
+    let textures = &context.world.textures;
+    let place = triangle_place(&surface, hit);
+    let look = match &material.detail {
+        Some(detail) if !detail.textured.is_empty() => {
+            detail.textured.iter().for_each(|t| textures[t.texture as usize].foresee(context.textures, place));
+            Appearance::Painted(place)
+        }
+        _ => Appearance::Even(material.look(textures, context.textures, place)?),
+    };
     let (normals, u, v, two_sided) = (surface.normals, hit.u, hit.v, material.two_sided);
     Some(Opaque { vertices, normals, u, v, d, look, two_sided, shape: surface.shape })
 }

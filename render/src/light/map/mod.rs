@@ -187,9 +187,13 @@ impl SkyMap {
     /// Asks for the columns there.
     #[inline]
     pub(super) fn foresee_columns(&self, row: usize, number: u32) {
-        let first = row * self.width as usize + self.column_guides.range(row, number).start;
-        if let Some(end) = self.columns.get(first) {
-            prefetch(end);
+        let range = self.column_guides.range(row, number);
+        let row = row * self.width as usize;
+        // as many as a part has on the average, and what begins in another line; where it is dark there may be many more
+        for i in [range.start, range.end] {
+            if let Some(end) = self.columns.get(row + i) {
+                prefetch(end);
+            }
         }
     }
 
