@@ -1,4 +1,4 @@
-//! Models as blocks of vertices take them: opaque ones whose lobe, if any, is an isotropic GGX one; parameters by value, functions without
+//! Models as blocks of vertices take them: opaque ones whose lobe, if any, is isotropic; parameters by value, functions without
 //! branches. They are the same inlined code as [`Bsdf::eval`] and [`Bsdf::sample`], so the bits are the same.
 
 use super::detail::{Textured, scaled, share};
@@ -22,6 +22,7 @@ pub(crate) enum Look {
 /// [`Bsdf::RoughPlastic`].
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Coat {
+    pub distribution: Distribution,
     pub alpha: f32,
     pub eta: f32,
     pub diffuse: [f32; 3],
@@ -34,6 +35,7 @@ pub(crate) struct Coat {
 /// [`Bsdf::RoughConductor`].
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Metal {
+    pub distribution: Distribution,
     pub alpha: f32,
     pub eta: [f32; 3],
     pub k: [f32; 3],
@@ -45,11 +47,8 @@ impl Material {
     #[inline(always)]
     pub(crate) fn has_look(&self) -> bool {
         let is_known = match &self.bsdf {
-            Bsdf::Diffuse { .. } => true,
-            Bsdf::RoughPlastic { distribution, .. } => *distribution == Distribution::Ggx,
-            Bsdf::RoughConductor { distribution, alpha, .. } => {
-                *distribution == Distribution::Ggx && alpha[0] == alpha[1]
-            }
+            Bsdf::Diffuse { .. } | Bsdf::RoughPlastic { .. } => true,
+            Bsdf::RoughConductor { alpha, .. } => alpha[0] == alpha[1],
             _ => false,
         };
         let is_paint = |detail: &Detail| {
@@ -66,7 +65,8 @@ impl Material {
         }
         let mut look = match &self.bsdf {
             Bsdf::Diffuse { reflectance } => Look::Diffuse(*reflectance),
-            Bsdf::RoughPlastic { alpha, eta, diffuse, specular, nonlinear, coat, .. } => Look::Coat(Coat {
+            Bsdf::RoughPlastic { distribution, alpha, eta, diffuse, specular, nonlinear, coat } => Look::Coat(Coat {
+                distribution: *distribution,
                 alpha: *alpha,
                 eta: *eta,
                 diffuse: *diffuse,
@@ -74,8 +74,8 @@ impl Material {
                 nonlinear: *nonlinear,
                 internal: coat.internal,
             }),
-            Bsdf::RoughConductor { alpha: [alpha, _], eta, k, specular, .. } => {
-                Look::Metal(Metal { alpha: *alpha, eta: *eta, k: *k, specular: *specular })
+            Bsdf::RoughConductor { distribution, alpha: [alpha, _], eta, k, specular } => {
+                Look::Metal(Metal { distribution: *distribution, alpha: *alpha, eta: *eta, k: *k, specular: *specular })
             }
             _ => return None,
         };
@@ -112,18 +112,23 @@ impl Coat {
     /// Value and density where the shares `entering` and `leaving` pass at the cosines of `wo` and `wi`.
     #[inline(always)]
     pub(crate) fn eval(&self, entering: f32, leaving: f32, wo: Vec3, wi: Vec3) -> Scatter {
-        self.coated().eval_between(&ggx(self.alpha), entering, leaving, self.internal, wo, wi)
+        self.coated().eval_between(&self.rough(), entering, leaving, self.internal, wo, wi)
     }
 
     /// A direction, and whether it is one.
     #[inline(always)]
     pub(crate) fn sample(&self, entering: f32, wo: Vec3, u: [f32; 2], lobe: f32) -> (Vec3, bool) {
-        let (coat, of_coat) = ggx(self.alpha).sample_or_not(wo, u);
+        let (coat, of_coat) = self.rough().sample_or_not(wo, u);
         let (base, of_base) = diffuse::sample_or_not(u);
         let is_coat = lobe < self.coated().coat_probability(1.0 - entering);
         let pick = |a: f32, b: f32| if is_coat { a } else { b };
         let wi = Vec3::new(pick(coat.x, base.x), pick(coat.y, base.y), pick(coat.z, base.z));
         (wi, (wo.z > 0.0) & ((is_coat & of_coat) | (!is_coat & of_base)))
+    }
+
+    #[inline(always)]
+    fn rough(&self) -> Rough {
+        Rough::new(self.distribution, [self.alpha, self.alpha])
     }
 
     #[inline(always)]
@@ -141,18 +146,18 @@ impl Metal {
     /// Value and density.
     #[inline(always)]
     pub(crate) fn eval(&self, wo: Vec3, wi: Vec3) -> Scatter {
-        let lobe = ggx(self.alpha).lobe(wo, wi);
+        let lobe = self.rough().lobe(wo, wi);
         lobe.reflecting(conductor::fresnel(lobe.cos, &self.eta, &self.k, &self.specular))
     }
 
     /// A direction, and whether it is one.
     #[inline(always)]
     pub(crate) fn sample(&self, wo: Vec3, u: [f32; 2]) -> (Vec3, bool) {
-        ggx(self.alpha).sample_or_not(wo, u)
+        self.rough().sample_or_not(wo, u)
     }
-}
 
-#[inline(always)]
-fn ggx(alpha: f32) -> Rough {
-    Rough::new(Distribution::Ggx, [alpha, alpha])
+    #[inline(always)]
+    fn rough(&self) -> Rough {
+        Rough::new(self.distribution, [self.alpha, self.alpha])
+    }
 }

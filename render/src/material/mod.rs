@@ -3,6 +3,7 @@
 //! Scattering is computed in a local frame whose z axis is the shading normal on the side of `wo`, the direction back along the ray. Both
 //! directions point away from the surface: `wo` has z above 0, and so has what is reflected; what is transmitted has z below 0.
 
+mod beckmann;
 mod conductor;
 mod detail;
 mod dielectric;

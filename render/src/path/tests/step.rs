@@ -145,14 +145,14 @@ fn motley() -> Scene {
 fn glossy() -> Scene {
     let mut scene = cornell::scene();
     let image = scene.image([2, 2], vec![200, 10, 30, 0, 90, 255, 128, 128, 128, 255, 255, 0]);
-    let coat = |alpha: f32, eta: f32, nonlinear| Bsdf::RoughPlastic {
-        distribution: Distribution::Ggx,
+    let coat = |alpha: f32, eta: f32, nonlinear, distribution| Bsdf::RoughPlastic {
+        distribution,
         alpha,
         eta,
         diffuse: [0.5, 0.3, 0.8],
         specular: [1.0, 0.9, 0.8],
         nonlinear,
-        coat: Transmittance::new(Distribution::Ggx, alpha, eta),
+        coat: Transmittance::new(distribution, alpha, eta),
     };
     let metal = |alpha: f32, distribution| Bsdf::RoughConductor {
         distribution,
@@ -166,11 +166,11 @@ fn glossy() -> Scene {
         ..Detail::default()
     };
     let materials = [
-        scene.material(coat(0.1, 1.5, false), true),
-        scene.material(coat(0.4, 1.9, true), false),
+        scene.material(coat(0.1, 1.5, false, Distribution::Ggx), true),
+        scene.material(coat(0.4, 1.9, true, Distribution::Beckmann), false),
         scene.material(metal(0.05, Distribution::Ggx), true),
         scene.material(metal(0.3, Distribution::Beckmann), true),
-        scene.detailed(coat(0.2, 1.3, true), paint(&[Slot::Diffuse, Slot::Specular])),
+        scene.detailed(coat(0.2, 1.3, true, Distribution::Ggx), paint(&[Slot::Diffuse, Slot::Specular])),
         scene.detailed(metal(0.2, Distribution::Ggx), paint(&[Slot::Alpha, Slot::Specular])),
         scene.detailed(metal(0.2, Distribution::Ggx), paint(&[Slot::AlphaU])),
         scene.diffuse(0.7),

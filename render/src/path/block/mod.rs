@@ -1,19 +1,20 @@
-//! Many vertices at once: triangles that are diffuse, or have one isotropic GGX lobe, in arrays that the compiler turns into vector code.
+//! Many vertices at once: triangles that are diffuse, or have one isotropic lobe, in arrays that the compiler turns into vector code.
 //!
 //! Vertices are collected in the order of their rays, up to [`N`]; then each phase runs over all of them. What a phase does to one vertex is
 //! the same inlined code that the plain way runs (`shade::scatter_plain`), so the bits are the same, and a test compares them. Other
 //! surfaces pass through and are shaded the plain way in their turn, so that the order of what comes out is that of the rays.
 
+mod lights;
+mod lobes;
+
 use glam::Vec3;
 
-use super::diffuse::{
-    Fate, cosine_direction, onwards, scattered_light, scattered_onwards, select, snap, towards_light,
-};
+use super::diffuse::{Fate, cosine_direction, onwards, select, snap, towards_light};
 use super::interaction::{Flat, smooth};
 use super::{Context, Outcome, PathRay, ShadowRay, wide};
-use crate::light::{Choice, Few, FewTriangles, LightSample, Node, TriangleLight, end, probability};
-use crate::material::{Coat, Look, Metal, Scatter};
-use crate::math::{Basis, UnitDir, offset_origin, unit};
+use crate::light::Choice;
+use crate::material::Look;
+use crate::math::{UnitDir, offset_origin, unit};
 use crate::ray::{PathKey, Ray};
 use crate::sampler::{BSDF, LIGHT, LIGHT_CHOICE, LOBE, ROULETTE, Streams};
 use crate::skip::Skip;
@@ -71,8 +72,9 @@ pub(super) enum Appearance {
 struct Kinds {
     smooth: bool,
     painted: bool,
-    coat: bool,
-    metal: bool,
+    /// By distribution, GGX's first.
+    coat: [bool; 2],
+    metal: [bool; 2],
 }
 
 /// Vertices by component. Lanes beyond `len`, and of vertices that pass through, hold what was there before: computed with, never read.
@@ -105,6 +107,7 @@ pub(super) struct Block {
     // of lobes, where there are any
     is_coat: [bool; N],
     is_metal: [bool; N],
+    is_beckmann: [bool; N],
     shape: [u32; N],
     alpha: Lanes,
     specular: Lanes3,
@@ -210,6 +213,7 @@ impl Default for Block {
             at: [At::uv([0.0; 2]); N],
             is_coat: [false; N],
             is_metal: [false; N],
+            is_beckmann: [false; N],
             shape: [0; N],
             alpha: lanes,
             specular: Lanes3::ZERO,
@@ -302,28 +306,6 @@ impl Block {
         self.len == N
     }
 
-    fn set_look(&mut self, i: usize, look: &Look) {
-        match look {
-            Look::Diffuse(reflectance) => self.reflectance.set(i, (*reflectance).into()),
-            Look::Coat(coat) => {
-                (self.is_coat[i], self.kinds.coat) = (true, true);
-                self.alpha[i] = coat.alpha;
-                self.eta.0[0][i] = coat.eta;
-                self.reflectance.set(i, coat.diffuse.into());
-                self.specular.set(i, coat.specular.into());
-                self.nonlinear[i] = coat.nonlinear;
-                self.internal[i] = coat.internal;
-            }
-            Look::Metal(metal) => {
-                (self.is_metal[i], self.kinds.metal) = (true, true);
-                self.alpha[i] = metal.alpha;
-                self.eta.set(i, metal.eta.into());
-                self.k.set(i, metal.k.into());
-                self.specular.set(i, metal.specular.into());
-            }
-        }
-    }
-
     /// Scatters all vertices and appends what comes of them to `out` in order; `plain` does those that pass through, by index, key and
     /// throughput.
     pub(super) fn flush(
@@ -370,13 +352,7 @@ impl Block {
     #[inline(always)]
     pub(super) fn phases(&mut self, context: &Context) {
         self.geometry();
-        if self.kinds.coat {
-            let mut cosines = [0.0; N];
-            for i in 0..N {
-                cosines[i] = self.shading.get(i).dot(-self.d.get(i));
-            }
-            self.entering = self.shares_of_coats(context, &cosines);
-        }
+        self.lobes_enter(context);
         self.numbers(context);
         self.choose_lights(context);
         self.sample_lights();
@@ -436,166 +412,6 @@ impl Block {
         self.place_bits = [raw[2], raw[3]];
     }
 
-    #[inline(always)]
-    fn choose_lights(&mut self, context: &Context) {
-        match context.lights.few_triangles() {
-            Some(Few::ByPower(few)) => return self.choose_by_power(few),
-            Some(Few::ByPlace(node, few)) => return self.choose_by_place(node, few),
-            None => {}
-        }
-        for i in 0..self.len {
-            // where a vertex passes there is no point to choose for
-            let (chosen, fewer) =
-                if self.passes[i] { (None, false) } else { context.lights.choose(self.origin.get(i), self.choice[i]) };
-            // what is seen from behind is black whatever shines there
-            self.fewer += u64::from(fewer & self.seen[i]);
-            self.chosen[i] = chosen;
-            let Some(choice) = self.chosen[i] else { continue };
-            let Some((triangle, radiance)) = context.lights.triangle(choice) else { continue };
-            self.light_p0.set(i, triangle.p0);
-            self.light_e1.set(i, triangle.e1);
-            self.light_e2.set(i, triangle.e2);
-            self.light_normal.set(i, triangle.normal);
-            self.light_area[i] = triangle.area;
-            self.light_error[i] = triangle.error;
-            self.radiance.set(i, radiance);
-            self.probability[i] = choice.probability;
-        }
-    }
-
-    /// By comparing each number with each source: the last whose interval begins at or before it.
-    #[inline(always)]
-    fn choose_by_power(&mut self, few: &[FewTriangles]) {
-        for light in few {
-            // bits all 1 where it is chosen: a select of floats would be unrolled into branches
-            let mut mask = [0; N];
-            for i in 0..N {
-                mask[i] = if self.choice[i] >= light.start { u32::MAX } else { 0 };
-            }
-            self.take(light, &mask);
-            set(&mut self.probability, light.probability, &mask);
-        }
-    }
-
-    /// As [`crate::light::Lights::choose`] does in the tree's only node: by the interval in which each number lies.
-    #[inline(always)]
-    fn choose_by_place(&mut self, node: &Node, few: &[FewTriangles]) {
-        const MOST: usize = 8;
-        let few = &few[..few.len().min(MOST)];
-        let (mut sums, mut counts) = ([[0.0; N]; MOST], [[0; N]; MOST]);
-        let (mut all, mut count) = ([0.0; N], [0; N]);
-        for k in 0..few.len() {
-            for i in 0..N {
-                let importance = node.importance(k, self.origin.get(i));
-                all[i] += importance;
-                count[i] += u32::from(importance > 0.0);
-                (sums[k][i], counts[k][i]) = (all[i], count[i]);
-            }
-        }
-        let (mut fewer, most) = (0u32, few.len() as u32);
-        for i in 0..N {
-            let is_fewer = count[i] < most;
-            fewer += u32::from((i < self.len) & is_fewer & self.seen[i] & !self.passes[i]);
-        }
-        self.fewer = u64::from(fewer);
-        let (mut begin, mut numbers) = ([0; N], [0; N]);
-        for (k, light) in few.iter().enumerate() {
-            let mut mask = [0; N];
-            for i in 0..N {
-                // where none shines there are no numbers to choose by
-                let length = if count[i] > 0 { 1 << 32 } else { 0 };
-                let end = end((sums[k][i], all[i]), (counts[k][i], count[i]), length);
-                let number = u64::from(self.choice[i]);
-                let is_chosen = (number >= begin[i]) & (number < end);
-                numbers[i] = if is_chosen { end - begin[i] } else { numbers[i] };
-                mask[i] = if is_chosen { u32::MAX } else { 0 };
-                begin[i] = end;
-            }
-            self.take(light, &mask);
-        }
-        for i in 0..N {
-            self.probability[i] = probability(numbers[i]);
-        }
-    }
-
-    /// Takes a light where the mask's bits are 1.
-    #[inline(always)]
-    fn take(&mut self, FewTriangles { light, radiance, .. }: &FewTriangles, mask: &[u32; N]) {
-        // written out: of loops over vectors and their components the compiler makes gathers and scatters across these
-        set3(&mut self.light_p0, light.p0, mask);
-        set3(&mut self.light_e1, light.e1, mask);
-        set3(&mut self.light_e2, light.e2, mask);
-        set3(&mut self.light_normal, light.normal, mask);
-        set3(&mut self.radiance, *radiance, mask);
-        set(&mut self.light_area, light.area, mask);
-        set(&mut self.light_error, light.error, mask);
-    }
-
-    #[inline(always)]
-    fn sample_lights(&mut self) {
-        for i in 0..N {
-            let light = TriangleLight {
-                p0: self.light_p0.get(i),
-                e1: self.light_e1.get(i),
-                e2: self.light_e2.get(i),
-                normal: self.light_normal.get(i),
-                area: self.light_area[i],
-                error: self.light_error[i],
-            };
-            let (d, tmax, pdf, ok) = light.sample_or_not(self.origin.get(i), [self.place[0][i], self.place[1][i]]);
-            self.light_d.set(i, d);
-            self.light_tmax[i] = tmax;
-            self.light_pdf[i] = pdf * self.probability[i];
-            self.lit[i] = ok & (self.probability[i] > 0.0);
-        }
-    }
-
-    /// Sources that are no triangles, one by one; and where nothing was chosen there is no light.
-    #[inline(always)]
-    fn other_lights(&mut self, context: &Context) {
-        if context.lights.few_triangles().is_some() {
-            return;
-        }
-        let far_sky = context.lights.has_far_sky();
-        let (mut skies, mut lanes, mut count) = ([[0; 2]; N], [0u8; N], 0);
-        let mut probability = 0.0;
-        for i in 0..self.len {
-            let Some(choice) = self.chosen[i] else {
-                self.lit[i] = false;
-                continue;
-            };
-            if far_sky && context.lights.is_sky(choice) {
-                // all of one probability
-                probability = choice.probability;
-                (skies[count], lanes[count]) = ([self.place_bits[0][i], self.place_bits[1][i]], i as u8);
-                count += 1;
-                continue;
-            }
-            if context.lights.only_triangles() || context.lights.triangle(choice).is_some() {
-                continue;
-            }
-            let place = [self.place_bits[0][i], self.place_bits[1][i]];
-            let light = context.lights.sample_chosen(choice, self.origin.get(i), place);
-            self.take_light(context, i, light);
-        }
-        if count > 0 {
-            context.lights.sample_skies(probability, &skies[..count], |k, light| {
-                self.take_light(context, usize::from(lanes[k]) & (N - 1), light);
-            });
-        }
-    }
-
-    #[inline(always)]
-    fn take_light(&mut self, context: &Context, i: usize, light: Option<LightSample>) {
-        self.lit[i] = light.is_some();
-        if let Some(light) = light {
-            self.light_d.set(i, light.d);
-            self.light_tmax[i] = light.tmax;
-            self.light_pdf[i] = light.pdf;
-            self.radiance.set(i, context.radiance(&light));
-        }
-    }
-
     // one loop for what is done in f64, one for the rest: a loop's vectors are as wide as its widest type allows
 
     /// `sends`: also where they bring nothing.
@@ -620,92 +436,11 @@ impl Block {
             );
             self.contribution.set(i, contribution);
         }
-        if self.kinds.coat {
-            for i in 0..N {
-                self.leaving[i] = self.shading.get(i).dot(self.shadow_d.get(i));
-            }
-            self.leaving = self.shares_of_coats(context, &self.leaving);
-            for i in 0..N {
-                let scatter = self.coat_scatters(i, self.shadow_d.get(i));
-                let contribution = select(self.is_coat[i], self.lobe_light(i, scatter), self.contribution.get(i));
-                self.contribution.set(i, contribution);
-            }
-        }
-        if self.kinds.metal {
-            for i in 0..N {
-                let scatter = self.metal_scatters(i, self.shadow_d.get(i));
-                let contribution = select(self.is_metal[i], self.lobe_light(i, scatter), self.contribution.get(i));
-                self.contribution.set(i, contribution);
-            }
-        }
+        self.lobes_towards_lights(context);
         for i in 0..N {
             let contribution = self.contribution.get(i);
             let brings = (contribution.x != 0.0) | (contribution.y != 0.0) | (contribution.z != 0.0);
             self.casts[i] = brings | (sends & self.lit[i] & self.seen[i]);
-        }
-    }
-
-    /// What passes the coats at these cosines; of a table a material, which no vector reads.
-    #[inline(always)]
-    fn shares_of_coats(&self, context: &Context, cosines: &Lanes) -> Lanes {
-        let world = context.world;
-        let mut out = [0.0; N];
-        for i in 0..self.len {
-            if self.is_coat[i] {
-                let material = &world.materials[world.shapes[self.shape[i] as usize].material as usize];
-                out[i] = material.coat().map_or(0.0, |coat| coat.at(cosines[i]));
-            }
-        }
-        out
-    }
-
-    /// Of a coat, towards a world direction that its light leaves by.
-    #[inline(always)]
-    fn coat_scatters(&self, i: usize, d: Vec3) -> Scatter {
-        let basis = Basis::new(self.shading.get(i));
-        let (wo, wi) = (basis.to_local(-self.d.get(i)), basis.to_local(d));
-        self.coat(i).eval(self.entering[i], self.leaving[i], wo, wi)
-    }
-
-    #[inline(always)]
-    fn metal_scatters(&self, i: usize, d: Vec3) -> Scatter {
-        let basis = Basis::new(self.shading.get(i));
-        let (wo, wi) = (basis.to_local(-self.d.get(i)), basis.to_local(d));
-        self.metal(i).eval(wo, wi)
-    }
-
-    #[inline(always)]
-    fn lobe_light(&self, i: usize, scatter: Scatter) -> Vec3 {
-        scattered_light(
-            self.throughput.get(i),
-            scatter,
-            self.normal.get(i),
-            self.shadow_d.get(i),
-            self.light_pdf[i],
-            self.radiance.get(i),
-            self.lit[i] & self.seen[i],
-        )
-    }
-
-    #[inline(always)]
-    fn coat(&self, i: usize) -> Coat {
-        Coat {
-            alpha: self.alpha[i],
-            eta: self.eta.0[0][i],
-            diffuse: [self.reflectance.0[0][i], self.reflectance.0[1][i], self.reflectance.0[2][i]],
-            specular: [self.specular.0[0][i], self.specular.0[1][i], self.specular.0[2][i]],
-            nonlinear: self.nonlinear[i],
-            internal: self.internal[i],
-        }
-    }
-
-    #[inline(always)]
-    fn metal(&self, i: usize) -> Metal {
-        Metal {
-            alpha: self.alpha[i],
-            eta: [self.eta.0[0][i], self.eta.0[1][i], self.eta.0[2][i]],
-            k: [self.k.0[0][i], self.k.0[1][i], self.k.0[2][i]],
-            specular: [self.specular.0[0][i], self.specular.0[1][i], self.specular.0[2][i]],
         }
     }
 
@@ -717,22 +452,7 @@ impl Block {
             self.next_d.set(i, d);
             self.above[i] = above & self.seen[i];
         }
-        if self.kinds.coat {
-            for i in 0..N {
-                let basis = Basis::new(self.shading.get(i));
-                let (wo, u) = (basis.to_local(-self.d.get(i)), [self.direction[0][i], self.direction[1][i]]);
-                let (wi, counts) = self.coat(i).sample(self.entering[i], wo, u, self.lobe[i]);
-                self.take_direction(i, basis.to_world(wi), counts, self.is_coat[i]);
-            }
-        }
-        if self.kinds.metal {
-            for i in 0..N {
-                let basis = Basis::new(self.shading.get(i));
-                let (wo, u) = (basis.to_local(-self.d.get(i)), [self.direction[0][i], self.direction[1][i]]);
-                let (wi, counts) = self.metal(i).sample(wo, u);
-                self.take_direction(i, basis.to_world(wi), counts, self.is_metal[i]);
-            }
-        }
+        self.lobes_directions();
         for i in 0..N {
             let (dir, d) = snap(self.next_d.get(i));
             self.next_dir[i] = dir;
@@ -754,45 +474,7 @@ impl Block {
             self.next_pdf[i] = pdf;
             self.fate[i] = fate;
         }
-        if self.kinds.coat {
-            for i in 0..N {
-                self.leaving[i] = self.shading.get(i).dot(self.next_d.get(i));
-            }
-            self.leaving = self.shares_of_coats(context, &self.leaving);
-            for i in 0..N {
-                let scatter = self.coat_scatters(i, self.next_d.get(i));
-                self.take_onwards(i, scatter, siblings, self.is_coat[i]);
-            }
-        }
-        if self.kinds.metal {
-            for i in 0..N {
-                let scatter = self.metal_scatters(i, self.next_d.get(i));
-                self.take_onwards(i, scatter, siblings, self.is_metal[i]);
-            }
-        }
-    }
-
-    #[inline(always)]
-    fn take_direction(&mut self, i: usize, d: Vec3, counts: bool, yes: bool) {
-        self.next_d.set(i, select(yes, d, self.next_d.get(i)));
-        self.above[i] = (yes & counts & self.seen[i]) | (!yes & self.above[i]);
-    }
-
-    #[inline(always)]
-    fn take_onwards(&mut self, i: usize, scatter: Scatter, siblings: f32, yes: bool) {
-        let (throughput, pdf, fate) = scattered_onwards(
-            self.throughput.get(i),
-            scatter,
-            self.normal.get(i),
-            self.next_d.get(i),
-            self.above[i],
-            self.go_on[i],
-            self.roulette[i],
-            siblings,
-        );
-        self.next_throughput.set(i, select(yes, throughput, self.next_throughput.get(i)));
-        self.next_pdf[i] = if yes { pdf } else { self.next_pdf[i] };
-        self.fate[i] = if yes { fate } else { self.fate[i] };
+        self.lobes_onwards(context);
     }
 
     /// Counts the vertices without a shadow ray; those that pass are counted where they are shaded.
