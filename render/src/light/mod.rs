@@ -283,6 +283,35 @@ impl Lights {
         (radiance, pdf * self.sky_probability)
     }
 
+    /// [`Lights::sky`] of many directions, given with their index.
+    pub(crate) fn skies(&self, directions: &[Vec3], mut give: impl FnMut(usize, (Vec3, f32))) {
+        self.sky.look_up_many(directions, |i, (radiance, pdf)| give(i, (radiance, pdf * self.sky_probability)));
+    }
+
+    /// Whether the sky is a picture, so that [`Lights::skies`] and [`Lights::sample_skies`] are worth collecting for.
+    #[inline]
+    pub(crate) fn has_far_sky(&self) -> bool {
+        self.sky.is_far()
+    }
+
+    /// Whether the sky was chosen.
+    #[inline]
+    pub(crate) fn is_sky(&self, choice: Choice) -> bool {
+        matches!(self.sources[choice.source].geometry, Geometry::Sky)
+    }
+
+    /// [`Lights::sample_chosen`] of the sky, with the probability of the choice and the numbers of the place, for many, given with their index.
+    pub(crate) fn sample_skies(
+        &self,
+        probability: f32,
+        places: &[[u32; 2]],
+        mut give: impl FnMut(usize, Option<LightSample>),
+    ) {
+        self.sky.sample_many(places, |i, sample| {
+            give(i, sample.map(|(d, radiance, pdf)| sky_sample(d, radiance, pdf * probability)));
+        });
+    }
+
     /// A direction from `o` to a source, by random bits: one number for the choice and two for the place. `None` when what was chosen shows
     /// `o` its back: that sample is worth 0.
     #[inline(always)]
@@ -310,7 +339,7 @@ impl Lights {
             }
             Geometry::Sky => {
                 let (d, radiance, pdf) = self.sky.sample(place)?;
-                return Some(LightSample { d, tmax: f32::INFINITY, radiance, look: None, pdf: pdf * probability });
+                return Some(sky_sample(d, radiance, pdf * probability));
             }
         };
         let pdf = pdf * probability;
@@ -441,6 +470,12 @@ fn children(sources: &[Source], node: &Node) -> Vec<FewTriangles> {
         Some(FewTriangles { start: 0, light, radiance: source.emission, probability: 0.0 })
     });
     few.collect::<Option<_>>().unwrap_or_default()
+}
+
+/// Of no end.
+#[inline(always)]
+fn sky_sample(d: Vec3, radiance: Vec3, pdf: f32) -> LightSample {
+    LightSample { d, tmax: f32::INFINITY, radiance, look: None, pdf }
 }
 
 /// The sky's share of the choice: all when it is alone, else by the power that enters the scene's bounding sphere, but at most

@@ -5,6 +5,7 @@
 
 use std::sync::Arc;
 
+use super::map::Place;
 use super::sun::Sun;
 use super::{SkyMap, sphere};
 use crate::math::{UnitDir, luminance};
@@ -15,6 +16,8 @@ use crate::world::{Environment, World};
 const WHOLE: u64 = 1 << 32;
 /// Neither sun nor dome is chosen less often than this where there are both: whichever is the brighter may be out of sight.
 const LEAST: f64 = 0.125;
+/// So many are sampled together: as many lines of memory as a processor fetches at a time, about.
+const MANY: usize = 32;
 
 /// The light that comes from infinitely far away, all around.
 #[derive(Clone, Debug)]
@@ -70,11 +73,36 @@ impl Sky {
         }
     }
 
+    /// Whether there is a picture, which memory holds and no cache: then many are sampled, or looked up, sooner than one by one.
+    pub(super) fn is_far(&self) -> bool {
+        matches!(self.dome, Dome::Map { .. })
+    }
+
     /// Radiance from a unit direction, and with which density in solid angle [`Sky::sample`] gives it.
     #[inline]
     pub(super) fn look_up(&self, d: Vec3) -> (Vec3, f32) {
-        let Some(sun) = &self.sun else { return self.dome.look_up(d) };
-        let (of_dome, of_sun) = (self.dome.look_up(d), sun.look_up(d));
+        self.look_up_at(d, self.dome.place(d))
+    }
+
+    /// [`Sky::look_up`] of many directions, given with their index: all are asked for before the first is read.
+    pub(super) fn look_up_many(&self, directions: &[Vec3], mut give: impl FnMut(usize, (Vec3, f32))) {
+        let mut places = [Place::default(); MANY];
+        for (k, part) in directions.chunks(MANY).enumerate() {
+            for (place, d) in places.iter_mut().zip(part) {
+                *place = self.dome.place(*d);
+                self.dome.foresee(place);
+            }
+            for (i, (place, d)) in places.iter().zip(part).enumerate() {
+                give(k * MANY + i, self.look_up_at(*d, *place));
+            }
+        }
+    }
+
+    #[inline]
+    fn look_up_at(&self, d: Vec3, place: Place) -> (Vec3, f32) {
+        let of_dome = self.dome.look_up(d, &place);
+        let Some(sun) = &self.sun else { return of_dome };
+        let of_sun = sun.look_up(d);
         let share = self.sun_end as f32 * (1.0 / WHOLE as f32);
         (of_dome.0 + of_sun.0, of_dome.1 * (1.0 - share) + of_sun.1 * share)
     }
@@ -82,25 +110,79 @@ impl Sky {
     /// A direction, the radiance from it, its density; `None` where what was chosen is not what the direction, snapped, lies in.
     #[inline]
     pub(super) fn sample(&self, u: [u32; 2]) -> Option<(Vec3, Vec3, f32)> {
-        let number = u64::from(u[0]);
-        let d = match &self.sun {
-            // what is left of the number is as random
-            Some(sun) if number < self.sun_end => sun.sample([((number << 32) / self.sun_end) as u32, u[1]]),
-            Some(_) => {
-                let rest = ((number - self.sun_end) << 32) / (WHOLE - self.sun_end);
-                self.dome.sample([rest as u32, u[1]])?
-            }
-            None => match &self.dome {
-                Dome::Constant(radiance) => {
-                    let d = sphere::uniform(u.map(crate::math::unit));
-                    return Some((d, *radiance, sphere::UNIFORM_PDF));
-                }
-                dome => dome.sample(u)?,
-            },
+        if let (None, Dome::Constant(radiance)) = (&self.sun, &self.dome) {
+            let d = sphere::uniform(u.map(crate::math::unit));
+            return Some((d, *radiance, sphere::UNIFORM_PDF));
+        }
+        let d = match self.choose(u) {
+            Part::Sun(d) => d,
+            Part::Dome(u) => self.dome.sample(u)?,
         };
         let (radiance, pdf) = self.look_up(d);
         (pdf > 0.0).then_some((d, radiance, pdf))
     }
+
+    /// [`Sky::sample`] by many pairs of numbers, given with their index: what a step reads is asked for by the step before, for all.
+    pub(super) fn sample_many(&self, numbers: &[[u32; 2]], mut give: impl FnMut(usize, Option<(Vec3, Vec3, f32)>)) {
+        let Dome::Map { map, .. } = &self.dome else {
+            numbers.iter().enumerate().for_each(|(i, u)| give(i, self.sample(*u)));
+            return;
+        };
+        let mut parts = [Part::Sun(Vec3::ZERO); MANY];
+        let mut rows = [(0, 0.0); MANY];
+        let mut places = [Place::default(); MANY];
+        for (k, some) in numbers.chunks(MANY).enumerate() {
+            for i in 0..some.len() {
+                parts[i] = self.choose(some[i]);
+                if let Part::Dome(u) = parts[i] {
+                    rows[i] = map.choose_row(u[0]);
+                    map.foresee_guide(rows[i].0, u[1]);
+                }
+            }
+            for i in 0..some.len() {
+                if let Part::Dome(u) = parts[i] {
+                    map.foresee_columns(rows[i].0, u[1]);
+                }
+            }
+            let mut directions = [Vec3::ZERO; MANY];
+            for i in 0..some.len() {
+                directions[i] = match parts[i] {
+                    Part::Sun(d) => d,
+                    Part::Dome(u) => self.dome.snapped(map.sample_row(rows[i], u[1])),
+                };
+                places[i] = self.dome.place(directions[i]);
+                map.foresee(&places[i]);
+            }
+            for i in 0..some.len() {
+                let (radiance, pdf) = self.look_up_at(directions[i], places[i]);
+                give(k * MANY + i, (pdf > 0.0).then_some((directions[i], radiance, pdf)));
+            }
+        }
+    }
+
+    /// Whether numbers stand for the sun, and then for which direction.
+    #[inline]
+    fn choose(&self, u: [u32; 2]) -> Part {
+        let number = u64::from(u[0]);
+        match &self.sun {
+            // what is left of the number is as random
+            Some(sun) if number < self.sun_end => Part::Sun(sun.sample([((number << 32) / self.sun_end) as u32, u[1]])),
+            Some(_) => {
+                let rest = ((number - self.sun_end) << 32) / (WHOLE - self.sun_end);
+                Part::Dome([rest as u32, u[1]])
+            }
+            None => Part::Dome(u),
+        }
+    }
+}
+
+/// What numbers stand for.
+#[derive(Clone, Copy, Debug)]
+enum Part {
+    /// A direction of the sun's.
+    Sun(Vec3),
+    /// Numbers for the dome.
+    Dome([u32; 2]),
 }
 
 impl Dome {
@@ -124,16 +206,41 @@ impl Dome {
         }
     }
 
+    /// Where a picture is looked up.
     #[inline]
-    fn look_up(&self, d: Vec3) -> (Vec3, f32) {
+    fn place(&self, d: Vec3) -> Place {
+        match self {
+            Dome::Map { map, to_map: [x, y, z], .. } => map.place(Vec3::new(x.dot(d), y.dot(d), z.dot(d))),
+            _ => Place::default(),
+        }
+    }
+
+    #[inline]
+    fn foresee(&self, place: &Place) {
+        if let Dome::Map { map, .. } = self {
+            map.foresee(place);
+        }
+    }
+
+    /// Of a direction and its place.
+    #[inline]
+    fn look_up(&self, d: Vec3, place: &Place) -> (Vec3, f32) {
         match self {
             Dome::None => (Vec3::ZERO, 0.0),
             Dome::Constant(radiance) => (*radiance, sphere::UNIFORM_PDF),
-            Dome::Map { map, scale, to_map: [x, y, z], upper } => {
-                let up = y.dot(d);
-                let (radiance, pdf) = map.look_up(Vec3::new(x.dot(d), up, z.dot(d)));
-                (if *upper && up < 0.0 { Vec3::ZERO } else { radiance * *scale }, pdf)
+            Dome::Map { map, scale, to_map: [_, y, _], upper } => {
+                let (radiance, pdf) = map.at(place);
+                (if *upper && y.dot(d) < 0.0 { Vec3::ZERO } else { radiance * *scale }, pdf)
             }
+        }
+    }
+
+    /// A direction of the picture, turned, as it travels.
+    #[inline]
+    fn snapped(&self, d: Vec3) -> Vec3 {
+        match self {
+            Dome::Map { to_map: [x, y, z], .. } => snapped(*x * d.x + *y * d.y + *z * d.z),
+            _ => d,
         }
     }
 
@@ -142,11 +249,50 @@ impl Dome {
     fn sample(&self, u: [u32; 2]) -> Option<Vec3> {
         match self {
             Dome::None => None,
-            Dome::Constant(_) => {
-                let d = sphere::uniform(u.map(crate::math::unit));
-                Some(Vec3::from(UnitDir::encode(d.to_array()).decode()))
+            Dome::Constant(_) => Some(snapped(sphere::uniform(u.map(crate::math::unit)))),
+            Dome::Map { map, .. } => Some(self.snapped(map.sample(u))),
+        }
+    }
+}
+
+#[inline]
+fn snapped(d: Vec3) -> Vec3 {
+    Vec3::from(UnitDir::encode(d.to_array()).decode())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::testing::Rng;
+
+    /// Many at once are what each alone is, whatever the sky and however many.
+    #[test]
+    fn many_are_each() {
+        let mut rng = Rng(31);
+        let texels = (0..32 * 17).map(|_| std::array::from_fn(|_| rng.f32().powi(3))).collect();
+        let map = Arc::new(SkyMap::new(32, 17, texels).unwrap());
+        let to_map = [[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]];
+        let picture = |upper| Some(Environment::Map { scale: 1.5, to_map, upper });
+        let sun = crate::world::Sun { direction: [0.0, 0.6, 0.8], up: [0.0; 3], cap: 0.1, radiance: [9.0; 3] };
+        for environment in [None, Some(Environment::Constant([1.0, 2.0, 3.0])), picture(false), picture(true)] {
+            for sun in [None, Some(sun)] {
+                let world = World { environment: environment.clone(), sun, ..World::default() };
+                let sky = Sky::new(&world, Some(map.clone()));
+                for count in [0, 1, MANY - 1, MANY, 3 * MANY + 5] {
+                    let numbers: Vec<[u32; 2]> = (0..count).map(|_| [rng.u32(), rng.u32()]).collect();
+                    let mut seen = 0;
+                    sky.sample_many(&numbers, |i, sample| {
+                        assert_eq!(sample, sky.sample(numbers[i]));
+                        seen += 1;
+                    });
+                    let directions: Vec<Vec3> = (0..count).map(|_| rng.direction()).collect();
+                    sky.look_up_many(&directions, |i, found| {
+                        assert_eq!(found, sky.look_up(directions[i]));
+                        seen += 1;
+                    });
+                    assert_eq!(seen, 2 * count);
+                }
             }
-            Dome::Map { map, to_map: [x, y, z], .. } => Some(map.sample_snapped(u, |d| *x * d.x + *y * d.y + *z * d.z)),
         }
     }
 }

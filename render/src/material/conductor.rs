@@ -4,12 +4,18 @@ use crate::real::{Vec3, f32};
 
 /// Unpolarised reflectance of a metal of index `eta + i k` in vacuum at cosine `cos`, times `factor`, per channel (the exact formula: Lagarde,
 /// "Memo on Fresnel equations", 2013; Born and Wolf, section 14.2).
-#[inline]
+#[inline(always)]
 pub(super) fn fresnel(cos: f32, eta: &[f32; 3], k: &[f32; 3], factor: &[f32; 3]) -> Vec3 {
     let cos = cos.clamp(0.0, 1.0);
-    Vec3::from_array(std::array::from_fn(|c| factor[c] * reflectance(cos, eta[c], k[c])))
+    // written out and without branches: blocks of vertices are compiled from it
+    Vec3::new(
+        factor[0] * reflectance(cos, eta[0], k[0]),
+        factor[1] * reflectance(cos, eta[1], k[1]),
+        factor[2] * reflectance(cos, eta[2], k[2]),
+    )
 }
 
+#[inline(always)]
 fn reflectance(cos: f32, eta: f32, k: f32) -> f32 {
     let cos2 = cos * cos;
     let sin2 = 1.0 - cos2;
@@ -19,12 +25,9 @@ fn reflectance(cos: f32, eta: f32, k: f32) -> f32 {
     let ab = (t * t + 4.0 * eta2 * k2).max(0.0).sqrt();
     let a = (0.5 * (ab + t)).max(0.0).sqrt();
     let (up, low) = (ab + cos2 - 2.0 * a * cos, ab + cos2 + 2.0 * a * cos);
-    if !(low > 0.0) {
-        return 1.0;
-    }
-    let s = up / low;
+    let (s, counts) = (up / low, low > 0.0);
     let (up, low) = (ab * cos2 + sin2 * sin2 - 2.0 * a * cos * sin2, ab * cos2 + sin2 * sin2 + 2.0 * a * cos * sin2);
     // both are 0 at perpendicular incidence of a perfect match only
     let p = if low > 0.0 { s * (up / low) } else { s };
-    (0.5 * (s + p)).clamp(0.0, 1.0)
+    if counts { (0.5 * (s + p)).clamp(0.0, 1.0) } else { 1.0 }
 }

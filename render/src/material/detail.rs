@@ -170,13 +170,13 @@ impl Amount {
 
 /// In [0, 1]; 0 for NaN.
 #[inline(always)]
-fn share(x: f32) -> f32 {
+pub(super) fn share(x: f32) -> f32 {
     if x > 0.0 { x.min(1.0) } else { 0.0 }
 }
 
 /// A colour times a factor, brought into [0, 1].
 #[inline(always)]
-fn scaled(color: Vec3, scale: [f32; 3]) -> [f32; 3] {
+pub(super) fn scaled(color: Vec3, scale: [f32; 3]) -> [f32; 3] {
     (color * Vec3::from(scale)).to_array().map(share)
 }
 
@@ -211,15 +211,6 @@ impl Material {
             }
         }
         bsdf
-    }
-
-    /// The albedo at a place, of a diffuse material.
-    #[inline]
-    pub fn albedo(&self, detail: &Detail, textures: &[Texture], tiles: &dyn Textures, at: At) -> Option<[f32; 3]> {
-        let Bsdf::Diffuse { reflectance } = self.bsdf else { return None };
-        let textured = detail.textured.iter().rev().find(|t| t.slot == Slot::Diffuse);
-        let color = |t: &Textured| scaled(textures[t.texture as usize].color(tiles, at), t.scale);
-        Some(textured.map_or(reflectance, color))
     }
 }
 

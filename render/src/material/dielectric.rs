@@ -10,21 +10,19 @@ use crate::real::{Vec3, f32};
 
 /// Unpolarised reflectance and the cosine of the refracted ray, for a ray at cosine `cos` (in [0, 1]) in a medium from which the other
 /// side has index `eta` (Born and Wolf, section 1.5). Total reflection: (1, 0).
-#[inline]
+#[inline(always)]
 pub(super) fn fresnel(cos: f32, eta: f32) -> (f32, f32) {
-    if eta == 1.0 {
-        return (0.0, cos);
-    }
+    // selects, no branches: blocks of vertices are compiled from it
+    let straight = cos;
     let cos = cos.clamp(0.0, 1.0);
     let inv = 1.0 / eta;
     let cos2_t = 1.0 - (1.0 - cos * cos) * (inv * inv);
-    if !(cos2_t > 0.0) {
-        return (1.0, 0.0);
-    }
+    let passes = cos2_t > 0.0;
     let cos_t = cos2_t.sqrt();
     let s = (cos - eta * cos_t) / (cos + eta * cos_t);
     let p = (eta * cos - cos_t) / (eta * cos + cos_t);
-    ((0.5 * (s * s + p * p)).min(1.0), cos_t)
+    let (r, cos_t) = if passes { ((0.5 * (s * s + p * p)).min(1.0), cos_t) } else { (1.0, 0.0) };
+    if eta == 1.0 { (0.0, straight) } else { (r, cos_t) }
 }
 
 /// A smooth interface: a mirror's direction or the refracted one, by their shares of the energy.

@@ -17,7 +17,14 @@ pub(super) fn eval(reflectance: [f32; 3], wo: Vec3, wi: Vec3) -> Scatter {
 /// Cosine-weighted (Malley's method).
 #[inline(always)]
 pub(super) fn sample(wo: Vec3, u: [f32; 2]) -> Option<Vec3> {
+    let (wi, counts) = sample_or_not(u);
+    (wo.z > 0.0 && counts).then_some(wi)
+}
+
+/// The direction, and whether it is one.
+#[inline(always)]
+pub(super) fn sample_or_not(u: [f32; 2]) -> (Vec3, bool) {
     let [x, y] = concentric_disk(u);
     let z2 = 1.0 - x * x - y * y;
-    (wo.z > 0.0 && z2 > 0.0).then(|| Vec3::new(x, y, z2.sqrt()))
+    (Vec3::new(x, y, z2.max(0.0).sqrt()), z2 > 0.0)
 }

@@ -3,10 +3,12 @@
 //! Scattering is computed in a local frame whose z axis is the shading normal on the side of `wo`, the direction back along the ray. Both
 //! directions point away from the surface: `wo` has z above 0, and so has what is reflected; what is transmitted has z below 0.
 
+mod beckmann;
 mod conductor;
 mod detail;
 mod dielectric;
 mod diffuse;
+mod gloss;
 mod phong;
 mod plastic;
 mod principled;
@@ -17,6 +19,7 @@ mod tests;
 use serde::{Deserialize, Serialize};
 
 pub use detail::{Amount, Blend, Detail, Relief, ReliefKind, Slot, Textured};
+pub(crate) use gloss::{Coat, Look, Metal};
 pub use plastic::Transmittance;
 pub use principled::Principled;
 
@@ -179,6 +182,14 @@ pub struct Scatter {
 impl Scatter {
     /// No scattering.
     pub const NONE: Scatter = Scatter { value: Vec3::ZERO, pdf: 0.0 };
+
+    /// None but where `yes`: selects, no branch.
+    #[inline(always)]
+    fn only(self, yes: bool) -> Scatter {
+        let pick = |x: f32| if yes { x } else { 0.0 };
+        let Scatter { value, pdf } = self;
+        Scatter { value: Vec3::new(pick(value.x), pick(value.y), pick(value.z)), pdf: pick(pdf) }
+    }
 }
 
 /// A direction sampled from a BSDF.

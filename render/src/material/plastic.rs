@@ -22,7 +22,7 @@ pub struct Transmittance {
     /// Share that enters, by cosine.
     entering: [f32; ENTRIES],
     /// Share of diffuse light from inside that is thrown back.
-    internal: f32,
+    pub(super) internal: f32,
 }
 
 #[derive(Serialize, Deserialize)]
@@ -65,7 +65,9 @@ impl Transmittance {
         Transmittance { entering, internal: (2.0 * sum / ENTRIES as f64) as f32 }
     }
 
-    fn at(&self, cos: f32) -> f32 {
+    /// Share that enters at a cosine; at the ends beyond 0 and 1.
+    #[inline(always)]
+    pub(crate) fn at(&self, cos: f32) -> f32 {
         let x = cos * (ENTRIES - 1) as f32;
         let i = (x as usize).min(ENTRIES - 2);
         let t = (x - i as f32).min(1.0);
@@ -106,19 +108,20 @@ pub(super) struct Coated {
 
 impl Coated {
     /// Probability of the coat's lobe, where it reflects the share `r`.
-    fn coat_probability(&self, r: f32) -> f32 {
+    #[inline(always)]
+    pub(super) fn coat_probability(&self, r: f32) -> f32 {
         let (d, s) = (mean(self.diffuse), mean(self.specular));
-        if !(d + s > 0.0) {
-            return 0.0;
-        }
         let weight = s / (d + s);
         let (coat, base) = (r * weight, (1.0 - r) * (1.0 - weight));
+        // neither for NaN, where both factors are 0
         if coat + base > 0.0 { coat / (coat + base) } else { 0.0 }
     }
 
     /// Base and cosine, for what enters and leaves by these shares and is thrown back by `internal`.
+    #[inline(always)]
     fn base(&self, entering: f32, leaving: f32, internal: f32, cos: f32) -> Vec3 {
-        let series = if self.nonlinear { Vec3::ONE - self.diffuse * internal } else { Vec3::splat(1.0 - internal) };
+        let colour = if self.nonlinear { self.diffuse } else { Vec3::ONE };
+        let series = Vec3::ONE - colour * internal;
         self.diffuse / series * (FRAC_1_PI * cos * entering * leaving / (self.eta * self.eta))
     }
 
@@ -145,17 +148,29 @@ impl Coated {
     }
 
     pub(super) fn eval_rough(&self, rough: &Rough, coat: &Transmittance, wo: Vec3, wi: Vec3) -> Scatter {
-        if !(wo.z > 0.0 && wi.z > 0.0) {
-            return Scatter::NONE;
-        }
-        let (t_o, t_i) = (coat.at(wo.z), coat.at(wi.z));
-        let probability = self.coat_probability(1.0 - t_o);
-        let base = self.base(t_o, t_i, coat.internal, wi.z);
-        let lobe = rough.eval(wo, wi, |cos| Vec3::splat(fresnel(cos, self.eta).0));
+        self.eval_between(rough, coat.at(wo.z), coat.at(wi.z), coat.internal, wo, wi)
+    }
+
+    /// Where the shares `entering` and `leaving` pass a rough coat at the cosines of `wo` and `wi`: without branches.
+    #[inline(always)]
+    pub(super) fn eval_between(
+        &self,
+        rough: &Rough,
+        entering: f32,
+        leaving: f32,
+        internal: f32,
+        wo: Vec3,
+        wi: Vec3,
+    ) -> Scatter {
+        let probability = self.coat_probability(1.0 - entering);
+        let base = self.base(entering, leaving, internal, wi.z);
+        let lobe = rough.lobe(wo, wi);
+        let lobe = lobe.reflecting(Vec3::splat(fresnel(lobe.cos, self.eta).0));
         Scatter {
             value: self.specular * lobe.value + base,
             pdf: probability * lobe.pdf + (1.0 - probability) * wi.z * FRAC_1_PI,
         }
+        .only((wo.z > 0.0) & (wi.z > 0.0))
     }
 
     pub(super) fn sample_rough(
@@ -178,6 +193,7 @@ impl Coated {
     }
 }
 
+#[inline(always)]
 fn mean(v: Vec3) -> f32 {
     (v.x + v.y + v.z) * (1.0 / 3.0)
 }

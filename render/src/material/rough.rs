@@ -4,10 +4,11 @@
 //! as in Mitsuba, masking and shadowing are independent (separable). Beckmann's masking is the exact one, not a rational fit, so that the
 //! density of what is sampled integrates to 1.
 
+use super::beckmann::visible_beckmann;
 use super::{Distribution, Scatter};
-use crate::math::sincos_turn;
+use crate::math::{erf_up, exp_down, sincos_turn};
 use crate::real::consts::PI;
-use crate::real::{Vec3, erf, exp, f32, log};
+use crate::real::{Vec3, f32};
 
 /// Least roughness; below it use a smooth metal (Mitsuba clamps likewise).
 const LEAST: f32 = 1e-4;
@@ -20,40 +21,73 @@ pub(super) struct Rough {
     ay: f32,
 }
 
+/// A pair of directions, but for what the microfacet reflects.
+pub(super) struct Lobe {
+    /// At the microfacet.
+    pub cos: f32,
+    pdf: f32,
+    value: f32,
+    counts: bool,
+}
+
+impl Lobe {
+    /// Where the microfacet reflects such a share.
+    #[inline(always)]
+    pub(super) fn reflecting(&self, share: Vec3) -> Scatter {
+        Scatter { value: share * self.value, pdf: self.pdf }.only(self.counts)
+    }
+}
+
 impl Rough {
-    #[inline]
+    #[inline(always)]
     pub(super) fn new(distribution: Distribution, alpha: [f32; 2]) -> Rough {
         Rough { distribution, ax: alpha[0].max(LEAST), ay: alpha[1].max(LEAST) }
     }
 
+    /// What a pair of directions reflects, by Fresnel's reflectance for the cosine at the microfacet.
+    #[inline(always)]
     pub(super) fn eval(&self, wo: Vec3, wi: Vec3, fresnel: impl Fn(f32) -> Vec3) -> Scatter {
-        if !(wo.z > 0.0 && wi.z > 0.0) {
-            return Scatter::NONE;
-        }
+        let lobe = self.lobe(wo, wi);
+        lobe.reflecting(fresnel(lobe.cos))
+    }
+
+    // of GGX without branches: blocks of vertices (`path::block`) are compiled from these, and not from what takes a closure, which stays a call
+    #[inline(always)]
+    pub(super) fn lobe(&self, wo: Vec3, wi: Vec3) -> Lobe {
         let sum = wo + wi;
         let length = sum.length();
         let m = sum / length;
         let cos_m = wo.dot(m);
-        if !(length > 0.0 && cos_m > 0.0) {
-            return Scatter::NONE;
-        }
+        let counts = (wo.z > 0.0) & (wi.z > 0.0) & (length > 0.0) & (cos_m > 0.0);
         let go = self.masking(wo);
         // D G1(wo) / (4 cos wo): the Jacobian of the reflection takes the cosine of the visible normals away
         let pdf = self.density(m) * go / (4.0 * wo.z);
-        Scatter { value: fresnel(cos_m) * (pdf * self.masking(wi)), pdf }
+        Lobe { cos: cos_m, pdf, value: pdf * self.masking(wi), counts }
     }
 
+    #[inline(always)]
     pub(super) fn sample(&self, wo: Vec3, u: [f32; 2]) -> Option<Vec3> {
-        let m = self.visible_normal(wo, u)?;
+        let (wi, counts) = self.sample_or_not(wo, u);
+        counts.then_some(wi)
+    }
+
+    /// The direction, and whether it is one.
+    #[inline(always)]
+    pub(super) fn sample_or_not(&self, wo: Vec3, u: [f32; 2]) -> (Vec3, bool) {
+        let (m, counts) = self.visible_or_not(wo, u);
         let wi = m * (2.0 * wo.dot(m)) - wo;
-        (wi.z > 0.0).then(|| wi / wi.length())
+        (wi / wi.length(), counts & (wi.z > 0.0))
     }
 
     /// A microfacet normal of unit length, of density `density(m) masking(wo) (wo . m) / wo.z` in solid angle.
     pub(super) fn visible_normal(&self, wo: Vec3, u: [f32; 2]) -> Option<Vec3> {
-        if !(wo.z > 0.0) {
-            return None;
-        }
+        let (m, counts) = self.visible_or_not(wo, u);
+        counts.then_some(m)
+    }
+
+    /// The normal, and whether it is one.
+    #[inline(always)]
+    fn visible_or_not(&self, wo: Vec3, u: [f32; 2]) -> (Vec3, bool) {
         // to the configuration of roughness 1
         let w = Vec3::new(self.ax * wo.x, self.ay * wo.y, wo.z);
         let w = w / w.length();
@@ -64,143 +98,51 @@ impl Rough {
         // and back
         let m = Vec3::new(self.ax * m.x, self.ay * m.y, m.z.max(0.0));
         let length = m.length();
-        (length > 0.0).then(|| m / length)
+        (m / length, (wo.z > 0.0) & (length > 0.0))
     }
 
     /// D(m).
+    #[inline(always)]
     pub(super) fn density(&self, m: Vec3) -> f32 {
-        if !(m.z > 0.0) {
-            return 0.0;
-        }
         let (x, y) = (m.x / self.ax, m.y / self.ay);
         let slope2 = x * x + y * y;
         let norm = PI * self.ax * self.ay;
-        match self.distribution {
+        let density = match self.distribution {
             Distribution::Ggx => {
                 let t = slope2 + m.z * m.z;
                 1.0 / (norm * t * t)
             }
             Distribution::Beckmann => {
                 let z2 = m.z * m.z;
-                let z4 = z2 * z2;
-                let e = exp(-slope2 / z2);
-                if e > 0.0 { e / (norm * z4) } else { 0.0 }
+                exp_down(-slope2 / z2) / (norm * (z2 * z2))
             }
-        }
+        };
+        if m.z > 0.0 { density } else { 0.0 }
     }
 
     /// Smith's G1(w) = 1 / (1 + Lambda(w)), for normals on the side of `w`; of `w` below the surface that of its mirror image.
+    #[inline(always)]
     pub(super) fn masking(&self, w: Vec3) -> f32 {
         let (x, y) = (self.ax * w.x, self.ay * w.y);
         let tan2 = (x * x + y * y) / (w.z * w.z);
-        if !(tan2 > 0.0) {
-            return 1.0;
-        }
-        match self.distribution {
+        let masking = match self.distribution {
             Distribution::Ggx => 2.0 / (1.0 + (1.0 + tan2).sqrt()),
             Distribution::Beckmann => {
                 let a = 1.0 / tan2.sqrt();
+                let e = exp_down(-a * a);
                 // Lambda is below 1e-9 from a = 4 on
-                if a >= 4.0 {
-                    return 1.0;
-                }
-                let e = exp(-a * a);
-                2.0 / (1.0 + erf(a) + e / (a * PI.sqrt()))
+                if a < 4.0 { 2.0 / (1.0 + erf_up(a, e) + e / (a * PI.sqrt())) } else { 1.0 }
             }
-        }
+        };
+        if tan2 > 0.0 { masking } else { 1.0 }
     }
 }
 
 /// Visible normal of GGX of roughness 1 (Dupuy and Benyoub 2023, "Sampling Visible GGX Normals with Spherical Caps").
+#[inline(always)]
 fn visible_ggx(w: Vec3, u: [f32; 2]) -> Vec3 {
     let (s, c) = sincos_turn(u[1]);
     let z = (1.0 - u[0]) * (1.0 + w.z) - w.z;
     let r = (1.0 - z * z).max(0.0).sqrt();
     Vec3::new(r * c, r * s, z) + w
-}
-
-/// Visible normal of Beckmann of roughness 1: slopes along the projection of `w` by inversion of their distribution function, across it
-/// normally distributed (Heitz and d'Eon 2014; the parametrisation by erf is Jakob's, 2014).
-fn visible_beckmann(w: Vec3, u: [f32; 2]) -> Vec3 {
-    let sin2 = w.x * w.x + w.y * w.y;
-    let across = slope_quantile(u[1]);
-    let sin = sin2.sqrt();
-    let tan = sin / w.z;
-    if !(tan > 1e-4) {
-        // straight from above every slope is visible alike
-        let along = slope_quantile(u[0]);
-        return Vec3::new(-along, -across, 1.0);
-    }
-    let along = visible_slope(f64::from(w.z) / f64::from(sin), f64::from(u[0]));
-    // rotate from the frame in which w lies in the xz plane
-    let (cos_phi, sin_phi) = (w.x / sin, w.y / sin);
-    Vec3::new(-(cos_phi * along - sin_phi * across), -(sin_phi * along + cos_phi * across), 1.0)
-}
-
-/// Slope along the view by its distribution function, P(slope < x) proportional to the integral to x of (cot - s) exp(-s^2), s < cot.
-///
-/// With the primitive H(x) = cot (1 + erf x) + exp(-x^2) / sqrt pi the distribution function is H(x) / H(cot). Bisection keeps a bracket,
-/// Newton finds the root inside it; H is increasing below cot.
-fn visible_slope(cot: f64, u: f64) -> f32 {
-    const INV_SQRT_PI: f64 = 0.564_189_583_547_756_3;
-    // erfc(-x) = 1 + erf x without cancellation at the lower end
-    let h = |x: f64| cot * libm::erfc(-x) + INV_SQRT_PI * libm::exp(-x * x);
-    let target = u.max(1e-9) * h(cot);
-    let (mut low, mut high) = (-6.0, cot.min(6.0));
-    let mut x = f64::from(slope_quantile(u as f32)).clamp(low, high);
-    for _ in 0..40 {
-        let error = h(x) - target;
-        if error > 0.0 {
-            high = x
-        } else {
-            low = x
-        }
-        // H' = 2 / sqrt pi (cot - x) exp(-x^2)
-        let step = error / (2.0 * INV_SQRT_PI * (cot - x) * libm::exp(-x * x));
-        let next = x - step;
-        let next = if next > low && next < high { next } else { 0.5 * (low + high) };
-        if (next - x).abs() < 1e-8 {
-            return next as f32;
-        }
-        x = next;
-    }
-    x as f32
-}
-
-/// `erfinv(2 u - 1)`: the slope of a Beckmann surface of roughness 1 along one axis (Giles 2012, "Approximating the erfinv function", single precision).
-fn slope_quantile(u: f32) -> f32 {
-    let x = (2.0 * u - 1.0).clamp(-0.999_999_9, 0.999_999_9);
-    let w = -log((1.0 - x) * (1.0 + x));
-    let p = if w < 5.0 {
-        let w = w - 2.5;
-        [
-            2.810_226_4e-8,
-            3.432_739_4e-7,
-            -3.523_387_7e-6,
-            -4.391_506_5e-6,
-            2.185_808_7e-4,
-            -1.253_725e-3,
-            -4.177_681_6e-3,
-            2.466_407_3e-1,
-            1.501_409_4,
-        ]
-        .iter()
-        .fold(0.0, |p, c| p * w + c)
-    } else {
-        let w = w.sqrt() - 3.0;
-        [
-            -2.002_142_6e-4,
-            1.009_505_6e-4,
-            1.349_343_2e-3,
-            -3.673_428_4e-3,
-            5.739_507_7e-3,
-            -7.622_461_3e-3,
-            9.438_870_5e-3,
-            1.001_674,
-            2.832_976_8,
-        ]
-        .iter()
-        .fold(0.0, |p, c| p * w + c)
-    };
-    p * x
 }

@@ -1,9 +1,10 @@
-//! Small mathematics that is the same bits on every machine: directions, frames, error bounds, hashes, sine and cosine.
+//! Small mathematics that is the same bits on every machine: directions, frames, error bounds, hashes, sine and cosine, exponential and logarithm.
 
 use crate::real::{Vec3, f32};
 
 #[cfg_attr(feature = "double", path = "dir_double.rs")]
 mod dir;
+mod exponential;
 mod frame;
 pub mod hash;
 mod offset;
@@ -12,6 +13,7 @@ mod tests;
 mod trig;
 
 pub use dir::UnitDir;
+pub(crate) use exponential::{erf_up, exp_down, ln};
 pub use frame::Basis;
 pub use offset::{Position, gamma, offset_origin};
 pub use trig::{concentric_disk, sincos_turn};

@@ -25,12 +25,9 @@ fn sincos_small(x: f32) -> (f32, f32) {
 pub fn sincos_turn(u: f32) -> (f32, f32) {
     let q = (u * 4.0 + 0.5) as i32;
     let (s, c) = sincos_small((u - q as f32 * 0.25) * (4.0 * FRAC_PI_2));
-    match q & 3 {
-        0 => (s, c),
-        1 => (c, -s),
-        2 => (-s, -c),
-        _ => (-c, s),
-    }
+    // by quarters (s, c), (c, -s), (-s, -c), (-c, s): selects, no branches
+    let (a, b) = if q & 1 == 0 { (s, c) } else { (c, s) };
+    (if q & 2 == 0 { a } else { -a }, if (q + 1) & 2 == 0 { b } else { -b })
 }
 
 /// The unit square onto the unit disk, keeping areas and strata (Shirley and Chiu 1997).

@@ -1,6 +1,7 @@
 //! What a hit looks like from the side it was hit from.
 
 use super::Surface;
+use super::vertex::select;
 use crate::math::{Basis, Position, gamma, offset_origin};
 use crate::ray::Hit;
 use crate::real::consts::PI;
@@ -101,7 +102,7 @@ impl Interaction {
         let normal = if from_front { front } else { -front };
         let shading = match &surface.normals {
             None => normal,
-            Some(normals) => interpolated(normals, hit, normal, d),
+            Some(normals) => smooth(normals.map(Vec3::from), hit.u, hit.v, normal, d),
         };
         Some(Interaction { position, front, normal, shading, from_front })
     }
@@ -109,12 +110,6 @@ impl Interaction {
     /// The point.
     pub(super) fn point(&self) -> Vec3 {
         self.position.p
-    }
-
-    /// Whether shading and geometric normal are one.
-    #[inline(always)]
-    pub(super) fn is_flat(&self) -> bool {
-        self.shading == self.normal
     }
 
     /// Origin of every ray that leaves on the side the ray came from.
@@ -233,16 +228,13 @@ pub(super) fn triangle_place(surface: &Surface, hit: &Hit) -> At {
 
 /// The interpolated shading normal, turned to the side of the geometric normal; the geometric normal itself where there is none,
 /// or where the ray sees the back of the interpolated one (which would be black, or let light through).
-fn interpolated(normals: &[[f32; 3]; 3], hit: &Hit, normal: Vec3, d: Vec3) -> Vec3 {
-    let [a, b, c] = normals.map(Vec3::from);
-    let n = a * (1.0 - hit.u - hit.v) + b * hit.u + c * hit.v;
+#[inline(always)]
+pub(super) fn smooth([a, b, c]: [Vec3; 3], u: f32, v: f32, normal: Vec3, d: Vec3) -> Vec3 {
+    let n = a * (1.0 - u - v) + b * u + c * v;
     let length = n.length();
-    if !(length > gamma(8)) || !length.is_finite() {
-        return normal;
-    }
     let n = n / length;
-    let n = if n.dot(normal) < 0.0 { -n } else { n };
-    if n.dot(d) < 0.0 { n } else { normal }
+    let n = select(n.dot(normal) < 0.0, -n, n);
+    select((length > gamma(8)) & (length < f32::INFINITY) & (n.dot(d) < 0.0), n, normal)
 }
 
 #[cfg(test)]
@@ -295,7 +287,7 @@ mod tests {
                     (false, true) => up - n * (2.0 * up.dot(n)),
                 };
                 assert!((at.shading.as_dvec3() - expected).length() < 1e-3, "{} {expected}", at.shading);
-                turned += u32::from(!at.is_flat());
+                turned += u32::from(at.shading != at.normal);
             }
         }
         assert!(turned > 1000, "{turned}");

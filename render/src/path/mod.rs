@@ -8,7 +8,6 @@
 mod aov;
 #[cfg(not(feature = "double"))]
 mod block;
-mod diffuse;
 mod interaction;
 #[cfg(not(feature = "double"))]
 mod primary;
@@ -17,6 +16,7 @@ pub mod reference;
 mod shade;
 #[cfg(test)]
 mod tests;
+mod vertex;
 #[cfg(not(feature = "double"))]
 mod wide;
 

@@ -1,11 +1,11 @@
 //! Shading of a batch.
 
 #[cfg(not(feature = "double"))]
-use super::block::{Block, FlatDiffuse};
-use super::diffuse::{Fate, cosine_direction, onwards, snap, towards_light};
+use super::block::{Appearance, Block, Opaque};
 use super::interaction::{Interaction, triangle_place};
+use super::vertex::{Fate, cosine_direction, onwards, snap, survive, towards_light};
 use super::{Context, Contribution, Outcome, PathRay, ShadowRay, Surface, Surfaces, power_heuristic};
-use crate::material::{Blend, Bsdf, Detail, Material, Relief, ReliefKind};
+use crate::material::{Blend, Bsdf, Look, Material, Relief, ReliefKind};
 use crate::math::{UnitDir, unit};
 use crate::ray::{Hit, PathKey, Ray};
 use crate::real::{Vec3, f32};
@@ -43,20 +43,20 @@ pub fn shade_traced<S: Surfaces>(
     out.counters.shaded += rays.len() as u64;
     let looks_up = looks_up(context);
     let bares = context.skips.makes(Skip::Details);
-    let (is_far, has_textures) = (surfaces.is_far(), !context.world.textures.is_empty());
+    let far_sky = looks_up && context.lights.has_far_sky();
+    if far_sky {
+        shade_missed(context, rays, traced, hits, out);
+    }
+    let is_far = surfaces.is_far();
     for (index, ((ray, traced), hit)) in rays.iter().zip(traced).zip(hits).enumerate() {
-        if is_far && let Some(hit) = hits.get(index + SURFACES_AHEAD).filter(|hit| hit.is_hit()) {
+        if is_far && let Some(hit) = hits.get(index + AHEAD).filter(|hit| hit.is_hit()) {
             surfaces.foresee(hit);
-        }
-        if has_textures && let (Some(ray), Some(hit)) = (rays.get(index + TEXELS_AHEAD), hits.get(index + TEXELS_AHEAD))
-        {
-            foresee_texels(context, surfaces, index + TEXELS_AHEAD, ray, hit);
         }
         if !hit.is_hit() {
             out.counters.missed += 1;
             if !looks_up {
                 out.counters.skyless += 1;
-            } else if is_first(context, ray) && !hidden(context, ray) {
+            } else if !far_sky && is_first(context, ray) && !hidden(context, ray) {
                 let (radiance, pdf) = context.lights.sky(traced.d.into());
                 emit(ray, radiance, pdf, out);
             }
@@ -65,23 +65,11 @@ pub fn shade_traced<S: Surfaces>(
         let Some(Leaving { material, children, throughput }) = arrive(context, surfaces, index, ray, hit, out) else {
             continue;
         };
-        let flat = match (&material.bsdf, &material.detail) {
-            // by way of `scatter_plain`, which looks for detail
-            _ if !bares => None,
-            (Bsdf::Diffuse { reflectance }, None) => surfaces.flat_triangle(index, hit).map(|vertices| FlatDiffuse {
-                vertices,
-                u: hit.u,
-                v: hit.v,
-                d: traced.d,
-                reflectance: *reflectance,
-                two_sided: material.two_sided,
-            }),
-            (Bsdf::Diffuse { .. }, Some(detail)) => painted(context, surfaces, index, hit, traced.d, material, detail),
-            _ => None,
-        };
+        // where nothing is to be skipped by way of `scatter_plain`, which looks for detail
+        let opaque = if bares { opaque(context, surfaces, index, hit, traced.d, material) } else { None };
         for child in 0..children {
             let key = PathKey { branch: ray.key.branch + child as u16, ..ray.key };
-            if block.push(index as u32, key, throughput, flat.as_ref()) {
+            if block.push(index as u32, key, throughput, opaque.as_ref()) {
                 flush(context, surfaces, rays, hits, &mut block, out);
             }
         }
@@ -90,30 +78,31 @@ pub fn shade_traced<S: Surfaces>(
     out.block = Some(block);
 }
 
-/// Hits that lie so far ahead are asked for: first their surfaces, then, when these are there, their texels. A vertex takes some 1000 cycles, memory some 300;
-/// twice as many as are needed leave room for a block that is flushed in between.
-const SURFACES_AHEAD: usize = 16;
-const TEXELS_AHEAD: usize = 8;
-
-/// Asks for the texels that shading a hit will look up; of materials within the one that is met, they come when they are needed.
+/// What rays that missed bring of a sky that lies in memory far away, some at a time.
+#[cfg(not(feature = "double"))]
 #[inline(never)]
-fn foresee_texels<S: Surfaces>(context: &Context, surfaces: &S, index: usize, ray: &PathRay, hit: &Hit) {
-    if !hit.is_hit() || u32::from(ray.key.vertex) + 1 >= context.frame.max_depth {
-        return;
+fn shade_missed(context: &Context, rays: &[PathRay], traced: &[Ray], hits: &[Hit], out: &mut Outcome) {
+    const SOME: usize = 32;
+    let (mut indices, mut directions, mut count) = ([0; SOME], [Vec3::ZERO; SOME], 0);
+    let mut bring = |indices: &[usize], directions: &[Vec3]| {
+        context.lights.skies(directions, |k, (radiance, pdf)| emit(&rays[indices[k]], radiance, pdf, out));
+    };
+    for (index, ((ray, traced), hit)) in rays.iter().zip(traced).zip(hits).enumerate() {
+        if !hit.is_hit() && is_first(context, ray) && !hidden(context, ray) {
+            (indices[count], directions[count]) = (index, traced.d.into());
+            count += 1;
+            if count == SOME {
+                bring(&indices, &directions);
+                count = 0;
+            }
+        }
     }
-    let world = context.world;
-    let material = &world.materials[world.shapes[surfaces.shape(index, hit) as usize].material as usize];
-    let Some(detail) = &material.detail else { return };
-    let mut textures = detail.textures().peekable();
-    if textures.peek().is_none() {
-        return;
-    }
-    let surface = surfaces.surface(index, hit);
-    if let Primitive::Triangle(_) = surface.geometry {
-        let place = triangle_place(&surface, hit);
-        textures.for_each(|t| world.textures[t as usize].foresee(context.textures, place));
-    }
+    bring(&indices[..count], &directions[..count]);
 }
+
+/// The surfaces of hits that lie so far ahead are asked for. A vertex takes some 1000 cycles one by one and 200 in a block, memory some 300: twice as
+/// many as are needed leave room for a block that is flushed in between.
+const AHEAD: usize = 16;
 
 /// The plain twin of `shade`: one vertex after the other.
 #[cfg(any(test, feature = "double"))]
@@ -185,25 +174,51 @@ struct Leaving<'a> {
 }
 
 #[cfg(not(feature = "double"))]
-/// A hit of a flat triangle whose albedo alone is a texture's.
-#[inline(never)]
-fn painted<S: Surfaces>(
+/// A hit that a block takes.
+#[inline(always)]
+fn opaque<S: Surfaces>(
     context: &Context,
     surfaces: &S,
     index: usize,
     hit: &Hit,
     d: [f32; 3],
     material: &Material,
-    detail: &Detail,
-) -> Option<FlatDiffuse> {
-    if !detail.is_paint() {
-        return None;
+) -> Option<Opaque> {
+    // most hits of most scenes
+    if let (Bsdf::Diffuse { reflectance }, None) = (&material.bsdf, &material.detail)
+        && let Some(vertices) = surfaces.flat_triangle(index, hit)
+    {
+        let look = Appearance::Even(Look::Diffuse(*reflectance));
+        let (u, v, two_sided) = (hit.u, hit.v, material.two_sided);
+        return Some(Opaque { vertices, normals: None, u, v, d, look, two_sided, shape: 0 });
     }
+    if material.has_look() { opaque_surface(context, surfaces, index, hit, d, material) } else { None }
+}
+
+#[cfg(not(feature = "double"))]
+/// The same of every look, with shading normals and textures.
+#[inline(never)]
+fn opaque_surface<S: Surfaces>(
+    context: &Context,
+    surfaces: &S,
+    index: usize,
+    hit: &Hit,
+    d: [f32; 3],
+    material: &Material,
+) -> Option<Opaque> {
     let surface = surfaces.surface(index, hit);
-    let (Primitive::Triangle(vertices), None) = (surface.geometry, surface.normals) else { return None };
+    let Primitive::Triangle(vertices) = surface.geometry else { return None };
+    let textures = &context.world.textures;
     let place = triangle_place(&surface, hit);
-    let reflectance = material.albedo(detail, &context.world.textures, context.textures, place)?;
-    Some(FlatDiffuse { vertices, u: hit.u, v: hit.v, d, reflectance, two_sided: material.two_sided })
+    let look = match &material.detail {
+        Some(detail) if !detail.textured.is_empty() => {
+            detail.textured.iter().for_each(|t| textures[t.texture as usize].foresee(context.textures, place));
+            Appearance::Painted(place)
+        }
+        _ => Appearance::Even(material.look(textures, context.textures, place)?),
+    };
+    let (normals, u, v, two_sided) = (surface.normals, hit.u, hit.v, material.two_sided);
+    Some(Opaque { vertices, normals, u, v, d, look, two_sided, shape: surface.shape })
 }
 
 /// Emission, depth and splitting; `None` when the path ends here.
@@ -363,21 +378,20 @@ pub(super) fn scatter_plain(
         }
     };
 
-    let (o, dir, throughput, pdf, fate) = if let (Bsdf::Diffuse { reflectance }, true, true) =
-        (bsdf, at.is_flat(), opacity >= 1.0)
-    {
+    let (o, dir, throughput, pdf, fate) = if let (Bsdf::Diffuse { reflectance }, true) = (bsdf, opacity >= 1.0) {
         let reflectance = Vec3::from(*reflectance);
         if let Some(light) = light {
             let (dir, wi) = snap(light.d);
             let radiance = context.radiance(&light);
             let contribution =
-                towards_light(throughput, reflectance, at.normal, light.d, wi, light.pdf, radiance, true);
+                towards_light(throughput, reflectance, at.normal, at.shading, light.d, wi, light.pdf, radiance, true);
             shadow(origin, dir, light.tmax, contribution, out);
         }
         note_unlit(out);
-        let (d, above) = cosine_direction(at.normal, direction);
+        let (d, above) = cosine_direction(at.shading, direction);
         let (dir, wi) = snap(d);
-        let (throughput, pdf, fate) = onwards(throughput, reflectance, at.normal, wi, above, go_on, roulette, siblings);
+        let (throughput, pdf, fate) =
+            onwards(throughput, reflectance, at.normal, at.shading, wi, above, go_on, roulette, siblings);
         (origin, dir, throughput, pdf, fate)
     } else {
         let basis = at.basis(surface, bsdf.is_anisotropic());
@@ -439,19 +453,8 @@ pub(super) fn scatter_plain(
                 (dir, weight, pdf, leaves, if sampled.wi.z < 0.0 { at.origin_beyond() } else { origin })
             }
         };
-        let throughput = throughput * weight;
-        let largest = throughput.max_element();
-        // siblings are as likely to go on as an only child
-        let chance = if roulette { (largest * siblings).min(0.95) } else { 1.0 };
-        // false for NaN: 0 / 0 of a direction that snapping took below the horizon
-        let fate = if !(leaves && largest > 0.0) {
-            Fate::Absorbed
-        } else if go_on >= chance {
-            Fate::Roulette
-        } else {
-            Fate::On
-        };
-        (o, dir, throughput / chance, pdf, fate)
+        let (throughput, fate) = survive(throughput * weight, leaves, go_on, roulette, siblings);
+        (o, dir, throughput, pdf, fate)
     };
     match fate {
         Fate::On => {

@@ -12,7 +12,7 @@
 #[cfg(test)]
 mod tests;
 
-use crate::math::{UnitDir, luminance, sincos_turn};
+use crate::math::{luminance, sincos_turn};
 use crate::memory::{prefetch, spacious};
 use crate::real::consts::PI;
 use crate::real::{Stored, Vec3, atan2, f32, real, stored};
@@ -67,7 +67,8 @@ pub enum SkyMapError {
 }
 
 /// A patch, and where in it.
-struct Place {
+#[derive(Clone, Copy, Debug, Default)]
+pub(super) struct Place {
     x: u32,
     y: u32,
     fx: f32,
@@ -155,17 +156,61 @@ impl SkyMap {
     }
 
     /// Both.
-    #[inline]
+    #[cfg(test)]
     pub(super) fn look_up(&self, d: Vec3) -> (Vec3, f32) {
-        let place = self.place(d);
-        (self.bilinear(&place), self.density_at(&place))
+        self.at(&self.place(d))
+    }
+
+    /// Radiance and density of a place.
+    #[inline]
+    pub(super) fn at(&self, place: &Place) -> (Vec3, f32) {
+        (self.bilinear(place), self.density_at(place))
     }
 
     /// A unit direction of the map, by two numbers of 32 random bits.
     pub fn sample(&self, u: [u32; 2]) -> Vec3 {
-        let (y, down) = choose(&self.rows, self.row_guide.range(0, u[0]), u[0]);
+        self.sample_row(self.choose_row(u[0]), u[1])
+    }
+
+    /// A row of patches and how far down in it, by the first number.
+    #[inline]
+    pub(super) fn choose_row(&self, number: u32) -> (usize, f64) {
+        choose(&self.rows, self.row_guide.range(0, number), number)
+    }
+
+    /// Asks for where in a row's columns to look for the second number.
+    #[inline]
+    pub(super) fn foresee_guide(&self, row: usize, number: u32) {
+        prefetch(&self.column_guides.firsts[self.column_guides.place(row, number)]);
+    }
+
+    /// Asks for the columns there.
+    #[inline]
+    pub(super) fn foresee_columns(&self, row: usize, number: u32) {
+        let range = self.column_guides.range(row, number);
+        let row = row * self.width as usize;
+        // as many as a part has on the average, and what begins in another line; where it is dark there may be many more
+        for i in [range.start, range.end] {
+            if let Some(end) = self.columns.get(row + i) {
+                prefetch(end);
+            }
+        }
+    }
+
+    /// Asks for what [`SkyMap::at`] reads.
+    #[inline]
+    pub(super) fn foresee(&self, at: &Place) {
+        let first = at.y as usize * self.width as usize + at.x as usize;
+        prefetch(&self.texels[first]);
+        prefetch(&self.texels[first + self.width as usize]);
+        prefetch(&self.columns[first]);
+    }
+
+    /// A direction in a row of patches, by the second number.
+    #[inline]
+    pub(super) fn sample_row(&self, (y, down): (usize, f64), number: u32) -> Vec3 {
         let w = self.width as usize;
-        let (x, along) = choose(&self.columns[y * w..][..w], self.column_guides.range(y, u[1]), u[1]);
+        let (x, along) = choose(&self.columns[y * w..][..w], self.column_guides.range(y, number), number);
         // whoever samples wants the radiance
         prefetch(&self.texels[y * w + x]);
         prefetch(&self.texels[(y + 1) * w + x]);
@@ -178,7 +223,7 @@ impl SkyMap {
 
     /// The patch that a direction lies in: a function of the direction alone, so that a direction has one density whoever asks.
     #[inline]
-    fn place(&self, d: Vec3) -> Place {
+    pub(super) fn place(&self, d: Vec3) -> Place {
         let u = atan2(d.x, -d.z) * (0.5 / PI);
         let v = atan2((d.x * d.x + d.z * d.z).sqrt(), d.y) * (1.0 / PI);
         let width = self.width as f32;
@@ -237,12 +282,6 @@ impl SkyMap {
         all.extend(bytes[HEAD..].chunks_exact(12).map(|t| [value(&t[..4]), value(&t[4..8]), value(&t[8..])]));
         SkyMap::new(width, height, all)
     }
-
-    /// [`SkyMap::sample`], turned, as it travels.
-    #[inline]
-    pub(super) fn sample_snapped(&self, u: [u32; 2], to_world: impl Fn(Vec3) -> Vec3) -> Vec3 {
-        Vec3::from(UnitDir::encode(to_world(self.sample(u)).to_array()).decode())
-    }
 }
 
 /// Upper ends of consecutive intervals of [0, [`WHOLE`]) in proportion to the weights; all 0 if the weights are.
@@ -297,10 +336,16 @@ impl Guide {
         Guide { shift, firsts }
     }
 
+    /// Where the part of a row that holds a number stands.
+    #[inline]
+    fn place(&self, row: usize, number: u32) -> usize {
+        row * ((WHOLE >> self.shift) as usize + 1) + (number >> 1 >> self.shift) as usize
+    }
+
     /// Where in a row the interval is that holds a number (its lowest bit aside): the first whose end is above it, or the range's end.
     #[inline]
     fn range(&self, row: usize, number: u32) -> std::ops::Range<usize> {
-        let at = row * ((WHOLE >> self.shift) as usize + 1) + (number >> 1 >> self.shift) as usize;
+        let at = self.place(row, number);
         self.firsts[at] as usize..self.firsts[at + 1] as usize
     }
 }

@@ -1,6 +1,7 @@
 use glam::DVec3;
 
 use super::*;
+use crate::math::UnitDir;
 use crate::testing::{Rng, chi_square};
 
 /// A map with bright spots, dark patches, and a row and columns of no light.

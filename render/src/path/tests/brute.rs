@@ -16,7 +16,7 @@ use crate::path::reference::Tracer;
 use crate::path::{Surface, Surfaces};
 use crate::ray::{Hit, MISS, PrimId, Ray};
 use crate::texture::{Bitmap, Filter as TexelFilter, Texel, Texture, Tiles, UvMap, Wrap};
-use crate::world::{Beam, EmissivePrimitive, Environment, Glow, Primitive, ShapeInfo, World};
+use crate::world::{Beam, EmissivePrimitive, Environment, Glow, Primitive, ShapeInfo, Sun, World};
 
 /// A scene in a list.
 #[derive(Default)]
@@ -29,6 +29,7 @@ pub struct Scene {
     pub environment: Option<[f32; 3]>,
     /// In place of `environment`: a picture, and rows of the rotation to it.
     pub sky_map: Option<(Arc<SkyMap>, [[f32; 3]; 3])>,
+    pub sun: Option<Sun>,
     pub textures: Vec<Texture>,
     pub tiles: Tiles,
     /// By primitive: its texture coordinates and attribute.
@@ -124,7 +125,7 @@ impl Scene {
                 Some((_, to_map)) => Some(Environment::Map { scale: 1.0, to_map: *to_map, upper: false }),
                 None => self.environment.map(Environment::Constant),
             },
-            sun: None,
+            sun: self.sun,
             lo: lo.to_array(),
             hi: hi.to_array(),
         }

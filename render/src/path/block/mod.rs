@@ -1,19 +1,24 @@
-//! Many vertices at once: flat diffuse triangles, which most vertices are, in arrays that the compiler turns into vector code.
+//! Many vertices at once: triangles that are diffuse, or have one isotropic lobe, in arrays that the compiler turns into vector code.
 //!
 //! Vertices are collected in the order of their rays, up to [`N`]; then each phase runs over all of them. What a phase does to one vertex is
 //! the same inlined code that the plain way runs (`shade::scatter_plain`), so the bits are the same, and a test compares them. Other
 //! surfaces pass through and are shaded the plain way in their turn, so that the order of what comes out is that of the rays.
 
+mod lights;
+mod lobes;
+
 use glam::Vec3;
 
-use super::diffuse::{Fate, cosine_direction, onwards, snap, towards_light};
-use super::interaction::Flat;
+use super::interaction::{Flat, smooth};
+use super::vertex::{Fate, cosine_direction, onwards, select, snap, towards_light};
 use super::{Context, Outcome, PathRay, ShadowRay, wide};
-use crate::light::{Choice, Few, FewTriangles, Node, TriangleLight, end, probability};
+use crate::light::Choice;
+use crate::material::Look;
 use crate::math::{UnitDir, offset_origin, unit};
 use crate::ray::{PathKey, Ray};
-use crate::sampler::{BSDF, LIGHT, LIGHT_CHOICE, ROULETTE, Streams};
+use crate::sampler::{BSDF, LIGHT, LIGHT_CHOICE, LOBE, ROULETTE, Streams};
 use crate::skip::Skip;
+use crate::texture::At;
 
 /// Vertices of a block.
 pub(super) const N: usize = 32;
@@ -39,15 +44,37 @@ impl Lanes3 {
     }
 }
 
-/// A hit of a diffuse triangle without shading normals.
+/// A hit of a triangle that a block takes.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct FlatDiffuse {
+pub(super) struct Opaque {
     pub vertices: [[f32; 3]; 3],
+    pub normals: Option<[[f32; 3]; 3]>,
     pub u: f32,
     pub v: f32,
     pub d: [f32; 3],
-    pub reflectance: [f32; 3],
+    pub look: Appearance,
     pub two_sided: bool,
+    /// Number of its shape, where the look is no even diffuse one.
+    pub shape: u32,
+}
+
+/// What a hit looks like.
+#[derive(Clone, Copy, Debug)]
+pub(super) enum Appearance {
+    /// The same everywhere.
+    Even(Look),
+    /// By textures at a place, whose texels were asked for: they are read when the block is full.
+    Painted(At),
+}
+
+/// What some vertex of a block has that not all have.
+#[derive(Clone, Copy, Debug, Default)]
+struct Kinds {
+    smooth: bool,
+    painted: bool,
+    /// By distribution, GGX's first.
+    coat: [bool; 2],
+    metal: [bool; 2],
 }
 
 /// Vertices by component. Lanes beyond `len`, and of vertices that pass through, hold what was there before: computed with, never read.
@@ -66,9 +93,34 @@ pub(super) struct Block {
     u: Lanes,
     v: Lanes,
     d: Lanes3,
+    /// Albedo, also of a coat's base.
     reflectance: Lanes3,
+    kinds: Kinds,
+    // of shading normals, where there are any
+    is_smooth: [bool; N],
+    n0: Lanes3,
+    n1: Lanes3,
+    n2: Lanes3,
+    // of textures
+    is_painted: [bool; N],
+    at: [At; N],
+    // of lobes, where there are any
+    is_coat: [bool; N],
+    is_metal: [bool; N],
+    is_beckmann: [bool; N],
+    shape: [u32; N],
+    alpha: Lanes,
+    specular: Lanes3,
+    eta: Lanes3,
+    k: Lanes3,
+    nonlinear: [bool; N],
+    internal: Lanes,
+    entering: Lanes,
+    leaving: Lanes,
+    lobe: Lanes,
     // of the geometry
     normal: Lanes3,
+    shading: Lanes3,
     origin: Lanes3,
     seen: [bool; N],
     // numbers
@@ -152,7 +204,28 @@ impl Default for Block {
             v: lanes,
             d: Lanes3::ZERO,
             reflectance: Lanes3::ZERO,
+            kinds: Kinds::default(),
+            is_smooth: [false; N],
+            n0: Lanes3::ZERO,
+            n1: Lanes3::ZERO,
+            n2: Lanes3::ZERO,
+            is_painted: [false; N],
+            at: [At::uv([0.0; 2]); N],
+            is_coat: [false; N],
+            is_metal: [false; N],
+            is_beckmann: [false; N],
+            shape: [0; N],
+            alpha: lanes,
+            specular: Lanes3::ZERO,
+            eta: Lanes3::ZERO,
+            k: Lanes3::ZERO,
+            nonlinear: [false; N],
+            internal: lanes,
+            entering: lanes,
+            leaving: lanes,
+            lobe: lanes,
             normal: Lanes3::ZERO,
+            shading: Lanes3::ZERO,
             origin: Lanes3::ZERO,
             seen: [false; N],
             direction: [lanes; 2],
@@ -191,25 +264,43 @@ impl Default for Block {
 }
 
 impl Block {
-    /// Adds a vertex of the ray at `index` of the batch, with a sibling's key and throughput, and its surface if it is a flat diffuse triangle;
-    /// true when the block is full and must be flushed.
+    /// Adds a vertex of the ray at `index` of the batch, with a sibling's key and throughput, and its surface if a block takes it; true when the
+    /// block is full and must be flushed.
     #[inline(always)]
-    pub(super) fn push(&mut self, index: u32, key: PathKey, throughput: Vec3, flat: Option<&FlatDiffuse>) -> bool {
+    pub(super) fn push(&mut self, index: u32, key: PathKey, throughput: Vec3, hit: Option<&Opaque>) -> bool {
         // the mask changes nothing, and tells the compiler that there is a place
         let i = self.len & (N - 1);
         self.index[i] = index;
         self.key[i] = key;
         self.throughput.set(i, throughput);
-        self.passes[i] = flat.is_none();
-        if let Some(flat) = flat {
-            self.p0.set(i, flat.vertices[0].into());
-            self.p1.set(i, flat.vertices[1].into());
-            self.p2.set(i, flat.vertices[2].into());
-            self.u[i] = flat.u;
-            self.v[i] = flat.v;
-            self.d.set(i, flat.d.into());
-            self.reflectance.set(i, flat.reflectance.into());
-            self.two_sided[i] = flat.two_sided;
+        self.passes[i] = hit.is_none();
+        (self.is_smooth[i], self.is_painted[i]) = (false, false);
+        (self.is_coat[i], self.is_metal[i]) = (false, false);
+        if let Some(hit) = hit {
+            self.p0.set(i, hit.vertices[0].into());
+            self.p1.set(i, hit.vertices[1].into());
+            self.p2.set(i, hit.vertices[2].into());
+            self.u[i] = hit.u;
+            self.v[i] = hit.v;
+            self.d.set(i, hit.d.into());
+            self.two_sided[i] = hit.two_sided;
+            match &hit.look {
+                Appearance::Even(Look::Diffuse(reflectance)) => self.reflectance.set(i, (*reflectance).into()),
+                Appearance::Even(look) => {
+                    self.shape[i] = hit.shape;
+                    self.set_look(i, look);
+                }
+                Appearance::Painted(at) => {
+                    (self.is_painted[i], self.kinds.painted) = (true, true);
+                    (self.shape[i], self.at[i]) = (hit.shape, *at);
+                }
+            }
+            if let Some([n0, n1, n2]) = hit.normals {
+                (self.is_smooth[i], self.kinds.smooth) = (true, true);
+                self.n0.set(i, n0.into());
+                self.n1.set(i, n1.into());
+                self.n2.set(i, n2.into());
+            }
         }
         self.len += 1;
         self.len == N
@@ -228,6 +319,9 @@ impl Block {
         if few {
             self.passes = [true; N];
         } else {
+            if self.kinds.painted {
+                self.paint(context);
+            }
             wide::compute(self, context);
         }
         out.counters.chosen_of_fewer += std::mem::take(&mut self.fewer);
@@ -237,23 +331,38 @@ impl Block {
         } else {
             self.emit(out);
         }
-        self.len = 0;
+        (self.len, self.kinds) = (0, Kinds::default());
+    }
+
+    /// Reads the textures.
+    fn paint(&mut self, context: &Context) {
+        let world = context.world;
+        for i in 0..self.len {
+            if self.is_painted[i] && !self.passes[i] {
+                let material = &world.materials[world.shapes[self.shape[i] as usize].material as usize];
+                match material.look(&world.textures, context.textures, self.at[i]) {
+                    Some(look) => self.set_look(i, &look),
+                    None => self.passes[i] = true,
+                }
+            }
+        }
     }
 
     /// All phases but the last; inlined into each of their compilations.
     #[inline(always)]
     pub(super) fn phases(&mut self, context: &Context) {
         self.geometry();
+        self.lobes_enter(context);
         self.numbers(context);
         self.choose_lights(context);
         self.sample_lights();
         self.other_lights(context);
         let skips_unlit = context.skips.makes(Skip::Shadows);
-        self.shadow_rays(!skips_unlit);
+        self.shadow_rays(context, !skips_unlit);
         if skips_unlit {
             self.count_unlit();
         }
-        self.next_rays(context.frame.split as f32);
+        self.next_rays(context);
     }
 
     #[inline(always)]
@@ -265,14 +374,23 @@ impl Block {
             self.seen[i] = flat.from_front | self.two_sided[i];
             self.passes[i] |= !flat.sound;
         }
+        self.shading = self.normal;
+        if self.kinds.smooth {
+            for i in 0..N {
+                let (normal, d) = (self.normal.get(i), self.d.get(i));
+                let normals = [self.n0.get(i), self.n1.get(i), self.n2.get(i)];
+                let shading = smooth(normals, self.u[i], self.v[i], normal, d);
+                self.shading.set(i, select(self.is_smooth[i], shading, normal));
+            }
+        }
     }
 
     #[inline(always)]
     fn numbers(&mut self, context: &Context) {
         let frame = context.frame;
         let mut streams = Streams::new(frame.seed);
-        const DIMENSIONS: [usize; 5] = [BSDF, BSDF + 1, LIGHT, LIGHT + 1, ROULETTE];
-        let mut raw = [[0; N]; 5];
+        const DIMENSIONS: [usize; 6] = [BSDF, BSDF + 1, LIGHT, LIGHT + 1, ROULETTE, LOBE];
+        let mut raw = [[0; N]; 6];
         for i in 0..self.len {
             let key = self.key[i];
             let vertex = u32::from(key.vertex) + 1;
@@ -290,154 +408,15 @@ impl Block {
         units(&mut self.place[0], &raw[2]);
         units(&mut self.place[1], &raw[3]);
         units(&mut self.go_on, &raw[4]);
+        units(&mut self.lobe, &raw[5]);
         self.place_bits = [raw[2], raw[3]];
-    }
-
-    #[inline(always)]
-    fn choose_lights(&mut self, context: &Context) {
-        match context.lights.few_triangles() {
-            Some(Few::ByPower(few)) => return self.choose_by_power(few),
-            Some(Few::ByPlace(node, few)) => return self.choose_by_place(node, few),
-            None => {}
-        }
-        for i in 0..self.len {
-            // where a vertex passes there is no point to choose for
-            let (chosen, fewer) =
-                if self.passes[i] { (None, false) } else { context.lights.choose(self.origin.get(i), self.choice[i]) };
-            // what is seen from behind is black whatever shines there
-            self.fewer += u64::from(fewer & self.seen[i]);
-            self.chosen[i] = chosen;
-            let Some(choice) = self.chosen[i] else { continue };
-            let Some((triangle, radiance)) = context.lights.triangle(choice) else { continue };
-            self.light_p0.set(i, triangle.p0);
-            self.light_e1.set(i, triangle.e1);
-            self.light_e2.set(i, triangle.e2);
-            self.light_normal.set(i, triangle.normal);
-            self.light_area[i] = triangle.area;
-            self.light_error[i] = triangle.error;
-            self.radiance.set(i, radiance);
-            self.probability[i] = choice.probability;
-        }
-    }
-
-    /// By comparing each number with each source: the last whose interval begins at or before it.
-    #[inline(always)]
-    fn choose_by_power(&mut self, few: &[FewTriangles]) {
-        for light in few {
-            // bits all 1 where it is chosen: a select of floats would be unrolled into branches
-            let mut mask = [0; N];
-            for i in 0..N {
-                mask[i] = if self.choice[i] >= light.start { u32::MAX } else { 0 };
-            }
-            self.take(light, &mask);
-            set(&mut self.probability, light.probability, &mask);
-        }
-    }
-
-    /// As [`crate::light::Lights::choose`] does in the tree's only node: by the interval in which each number lies.
-    #[inline(always)]
-    fn choose_by_place(&mut self, node: &Node, few: &[FewTriangles]) {
-        const MOST: usize = 8;
-        let few = &few[..few.len().min(MOST)];
-        let (mut sums, mut counts) = ([[0.0; N]; MOST], [[0; N]; MOST]);
-        let (mut all, mut count) = ([0.0; N], [0; N]);
-        for k in 0..few.len() {
-            for i in 0..N {
-                let importance = node.importance(k, self.origin.get(i));
-                all[i] += importance;
-                count[i] += u32::from(importance > 0.0);
-                (sums[k][i], counts[k][i]) = (all[i], count[i]);
-            }
-        }
-        let (mut fewer, most) = (0u32, few.len() as u32);
-        for i in 0..N {
-            let is_fewer = count[i] < most;
-            fewer += u32::from((i < self.len) & is_fewer & self.seen[i] & !self.passes[i]);
-        }
-        self.fewer = u64::from(fewer);
-        let (mut begin, mut numbers) = ([0; N], [0; N]);
-        for (k, light) in few.iter().enumerate() {
-            let mut mask = [0; N];
-            for i in 0..N {
-                // where none shines there are no numbers to choose by
-                let length = if count[i] > 0 { 1 << 32 } else { 0 };
-                let end = end((sums[k][i], all[i]), (counts[k][i], count[i]), length);
-                let number = u64::from(self.choice[i]);
-                let is_chosen = (number >= begin[i]) & (number < end);
-                numbers[i] = if is_chosen { end - begin[i] } else { numbers[i] };
-                mask[i] = if is_chosen { u32::MAX } else { 0 };
-                begin[i] = end;
-            }
-            self.take(light, &mask);
-        }
-        for i in 0..N {
-            self.probability[i] = probability(numbers[i]);
-        }
-    }
-
-    /// Takes a light where the mask's bits are 1.
-    #[inline(always)]
-    fn take(&mut self, FewTriangles { light, radiance, .. }: &FewTriangles, mask: &[u32; N]) {
-        // written out: of loops over vectors and their components the compiler makes gathers and scatters across these
-        set3(&mut self.light_p0, light.p0, mask);
-        set3(&mut self.light_e1, light.e1, mask);
-        set3(&mut self.light_e2, light.e2, mask);
-        set3(&mut self.light_normal, light.normal, mask);
-        set3(&mut self.radiance, *radiance, mask);
-        set(&mut self.light_area, light.area, mask);
-        set(&mut self.light_error, light.error, mask);
-    }
-
-    #[inline(always)]
-    fn sample_lights(&mut self) {
-        for i in 0..N {
-            let light = TriangleLight {
-                p0: self.light_p0.get(i),
-                e1: self.light_e1.get(i),
-                e2: self.light_e2.get(i),
-                normal: self.light_normal.get(i),
-                area: self.light_area[i],
-                error: self.light_error[i],
-            };
-            let (d, tmax, pdf, ok) = light.sample_or_not(self.origin.get(i), [self.place[0][i], self.place[1][i]]);
-            self.light_d.set(i, d);
-            self.light_tmax[i] = tmax;
-            self.light_pdf[i] = pdf * self.probability[i];
-            self.lit[i] = ok & (self.probability[i] > 0.0);
-        }
-    }
-
-    /// Sources that are no triangles, one by one; and where nothing was chosen there is no light.
-    #[inline(always)]
-    fn other_lights(&mut self, context: &Context) {
-        if context.lights.few_triangles().is_some() {
-            return;
-        }
-        for i in 0..self.len {
-            let Some(choice) = self.chosen[i] else {
-                self.lit[i] = false;
-                continue;
-            };
-            if context.lights.only_triangles() || context.lights.triangle(choice).is_some() {
-                continue;
-            }
-            let place = [self.place_bits[0][i], self.place_bits[1][i]];
-            let light = context.lights.sample_chosen(choice, self.origin.get(i), place);
-            self.lit[i] = light.is_some();
-            if let Some(light) = light {
-                self.light_d.set(i, light.d);
-                self.light_tmax[i] = light.tmax;
-                self.light_pdf[i] = light.pdf;
-                self.radiance.set(i, context.radiance(&light));
-            }
-        }
     }
 
     // one loop for what is done in f64, one for the rest: a loop's vectors are as wide as its widest type allows
 
     /// `sends`: also where they bring nothing.
     #[inline(always)]
-    fn shadow_rays(&mut self, sends: bool) {
+    fn shadow_rays(&mut self, context: &Context, sends: bool) {
         for i in 0..N {
             let (dir, d) = snap(self.light_d.get(i));
             self.shadow_dir[i] = dir;
@@ -448,6 +427,7 @@ impl Block {
                 self.throughput.get(i),
                 self.reflectance.get(i),
                 self.normal.get(i),
+                self.shading.get(i),
                 self.light_d.get(i),
                 self.shadow_d.get(i),
                 self.light_pdf[i],
@@ -455,18 +435,24 @@ impl Block {
                 self.lit[i] & self.seen[i],
             );
             self.contribution.set(i, contribution);
+        }
+        self.lobes_towards_lights(context);
+        for i in 0..N {
+            let contribution = self.contribution.get(i);
             let brings = (contribution.x != 0.0) | (contribution.y != 0.0) | (contribution.z != 0.0);
             self.casts[i] = brings | (sends & self.lit[i] & self.seen[i]);
         }
     }
 
     #[inline(always)]
-    fn next_rays(&mut self, siblings: f32) {
+    fn next_rays(&mut self, context: &Context) {
+        let siblings = context.frame.split as f32;
         for i in 0..N {
-            let (d, above) = cosine_direction(self.normal.get(i), [self.direction[0][i], self.direction[1][i]]);
+            let (d, above) = cosine_direction(self.shading.get(i), [self.direction[0][i], self.direction[1][i]]);
             self.next_d.set(i, d);
             self.above[i] = above & self.seen[i];
         }
+        self.lobes_directions();
         for i in 0..N {
             let (dir, d) = snap(self.next_d.get(i));
             self.next_dir[i] = dir;
@@ -477,6 +463,7 @@ impl Block {
                 self.throughput.get(i),
                 self.reflectance.get(i),
                 self.normal.get(i),
+                self.shading.get(i),
                 self.next_d.get(i),
                 self.above[i],
                 self.go_on[i],
@@ -487,6 +474,7 @@ impl Block {
             self.next_pdf[i] = pdf;
             self.fate[i] = fate;
         }
+        self.lobes_onwards(context);
     }
 
     /// Counts the vertices without a shadow ray; those that pass are counted where they are shaded.

@@ -1,0 +1,163 @@
+//! Models as blocks of vertices take them: opaque ones whose lobe, if any, is isotropic; parameters by value, functions without
+//! branches. They are the same inlined code as [`Bsdf::eval`] and [`Bsdf::sample`], so the bits are the same.
+
+use super::detail::{Textured, scaled, share};
+use super::plastic::Coated;
+use super::rough::Rough;
+use super::{Bsdf, Detail, Distribution, Material, Scatter, Slot, Transmittance, conductor, diffuse};
+use crate::real::{Vec3, f32};
+use crate::texture::{At, Texture, Textures};
+
+/// What a block needs of a material at a hit.
+#[derive(Clone, Copy, Debug)]
+pub(crate) enum Look {
+    /// Lambertian, of this albedo.
+    Diffuse([f32; 3]),
+    /// A diffuse base under a rough coat.
+    Coat(Coat),
+    /// Rough metal.
+    Metal(Metal),
+}
+
+/// [`Bsdf::RoughPlastic`].
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Coat {
+    pub distribution: Distribution,
+    pub alpha: f32,
+    pub eta: f32,
+    pub diffuse: [f32; 3],
+    pub specular: [f32; 3],
+    pub nonlinear: bool,
+    /// Share of diffuse light from inside that is thrown back.
+    pub internal: f32,
+}
+
+/// [`Bsdf::RoughConductor`].
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Metal {
+    pub distribution: Distribution,
+    pub alpha: f32,
+    pub eta: [f32; 3],
+    pub k: [f32; 3],
+    pub specular: [f32; 3],
+}
+
+impl Material {
+    /// Whether [`Material::look`] says something, at every place.
+    #[inline(always)]
+    pub(crate) fn has_look(&self) -> bool {
+        let is_known = match &self.bsdf {
+            Bsdf::Diffuse { .. } | Bsdf::RoughPlastic { .. } => true,
+            Bsdf::RoughConductor { alpha, .. } => alpha[0] == alpha[1],
+            _ => false,
+        };
+        let is_paint = |detail: &Detail| {
+            let turns = |t: &Textured| matches!(t.slot, Slot::AlphaU | Slot::AlphaV);
+            detail.is_paint() && !detail.textured.iter().any(turns)
+        };
+        is_known && self.detail.as_deref().is_none_or(is_paint)
+    }
+
+    /// The model at a place as a block takes it; `None` where there is more to it.
+    pub(crate) fn look(&self, textures: &[Texture], tiles: &dyn Textures, at: At) -> Option<Look> {
+        if !self.has_look() {
+            return None;
+        }
+        let mut look = match &self.bsdf {
+            Bsdf::Diffuse { reflectance } => Look::Diffuse(*reflectance),
+            Bsdf::RoughPlastic { distribution, alpha, eta, diffuse, specular, nonlinear, coat } => Look::Coat(Coat {
+                distribution: *distribution,
+                alpha: *alpha,
+                eta: *eta,
+                diffuse: *diffuse,
+                specular: *specular,
+                nonlinear: *nonlinear,
+                internal: coat.internal,
+            }),
+            Bsdf::RoughConductor { distribution, alpha: [alpha, _], eta, k, specular } => {
+                Look::Metal(Metal { distribution: *distribution, alpha: *alpha, eta: *eta, k: *k, specular: *specular })
+            }
+            _ => return None,
+        };
+        let Some(detail) = &self.detail else { return Some(look) };
+        for &Textured { slot, texture, scale } in &detail.textured {
+            let texture = &textures[texture as usize];
+            match (slot, &mut look) {
+                (Slot::Diffuse, Look::Diffuse(color) | Look::Coat(Coat { diffuse: color, .. }))
+                | (
+                    Slot::Specular,
+                    Look::Coat(Coat { specular: color, .. }) | Look::Metal(Metal { specular: color, .. }),
+                ) => {
+                    *color = scaled(texture.color(tiles, at), scale);
+                }
+                (Slot::Alpha, Look::Metal(metal)) => metal.alpha = share(texture.amount(tiles, at) * scale[0]),
+                // of no meaning for this model, as in `Material::at`
+                _ => {}
+            }
+        }
+        Some(look)
+    }
+
+    /// The table of a rough coat.
+    #[inline(always)]
+    pub(crate) fn coat(&self) -> Option<&Transmittance> {
+        match &self.bsdf {
+            Bsdf::RoughPlastic { coat, .. } => Some(coat),
+            _ => None,
+        }
+    }
+}
+
+impl Coat {
+    /// Value and density where the shares `entering` and `leaving` pass at the cosines of `wo` and `wi`.
+    #[inline(always)]
+    pub(crate) fn eval(&self, entering: f32, leaving: f32, wo: Vec3, wi: Vec3) -> Scatter {
+        self.coated().eval_between(&self.rough(), entering, leaving, self.internal, wo, wi)
+    }
+
+    /// A direction, and whether it is one.
+    #[inline(always)]
+    pub(crate) fn sample(&self, entering: f32, wo: Vec3, u: [f32; 2], lobe: f32) -> (Vec3, bool) {
+        let (coat, of_coat) = self.rough().sample_or_not(wo, u);
+        let (base, of_base) = diffuse::sample_or_not(u);
+        let is_coat = lobe < self.coated().coat_probability(1.0 - entering);
+        let pick = |a: f32, b: f32| if is_coat { a } else { b };
+        let wi = Vec3::new(pick(coat.x, base.x), pick(coat.y, base.y), pick(coat.z, base.z));
+        (wi, (wo.z > 0.0) & ((is_coat & of_coat) | (!is_coat & of_base)))
+    }
+
+    #[inline(always)]
+    fn rough(&self) -> Rough {
+        Rough::new(self.distribution, [self.alpha, self.alpha])
+    }
+
+    #[inline(always)]
+    fn coated(&self) -> Coated {
+        Coated {
+            eta: self.eta,
+            diffuse: Vec3::new(self.diffuse[0], self.diffuse[1], self.diffuse[2]),
+            specular: Vec3::new(self.specular[0], self.specular[1], self.specular[2]),
+            nonlinear: self.nonlinear,
+        }
+    }
+}
+
+impl Metal {
+    /// Value and density.
+    #[inline(always)]
+    pub(crate) fn eval(&self, wo: Vec3, wi: Vec3) -> Scatter {
+        let lobe = self.rough().lobe(wo, wi);
+        lobe.reflecting(conductor::fresnel(lobe.cos, &self.eta, &self.k, &self.specular))
+    }
+
+    /// A direction, and whether it is one.
+    #[inline(always)]
+    pub(crate) fn sample(&self, wo: Vec3, u: [f32; 2]) -> (Vec3, bool) {
+        self.rough().sample_or_not(wo, u)
+    }
+
+    #[inline(always)]
+    fn rough(&self) -> Rough {
+        Rough::new(self.distribution, [self.alpha, self.alpha])
+    }
+}

@@ -1,0 +1,167 @@
+//! Choosing lights and points on them.
+
+use super::{Block, N, set, set3};
+use crate::light::{Few, FewTriangles, LightSample, Node, TriangleLight, end, probability};
+use crate::path::Context;
+
+impl Block {
+    #[inline(always)]
+    pub(super) fn choose_lights(&mut self, context: &Context) {
+        match context.lights.few_triangles() {
+            Some(Few::ByPower(few)) => return self.choose_by_power(few),
+            Some(Few::ByPlace(node, few)) => return self.choose_by_place(node, few),
+            None => {}
+        }
+        for i in 0..self.len {
+            // where a vertex passes there is no point to choose for
+            let (chosen, fewer) =
+                if self.passes[i] { (None, false) } else { context.lights.choose(self.origin.get(i), self.choice[i]) };
+            // what is seen from behind is black whatever shines there
+            self.fewer += u64::from(fewer & self.seen[i]);
+            self.chosen[i] = chosen;
+            let Some(choice) = self.chosen[i] else { continue };
+            let Some((triangle, radiance)) = context.lights.triangle(choice) else { continue };
+            self.light_p0.set(i, triangle.p0);
+            self.light_e1.set(i, triangle.e1);
+            self.light_e2.set(i, triangle.e2);
+            self.light_normal.set(i, triangle.normal);
+            self.light_area[i] = triangle.area;
+            self.light_error[i] = triangle.error;
+            self.radiance.set(i, radiance);
+            self.probability[i] = choice.probability;
+        }
+    }
+
+    /// By comparing each number with each source: the last whose interval begins at or before it.
+    #[inline(always)]
+    fn choose_by_power(&mut self, few: &[FewTriangles]) {
+        for light in few {
+            // bits all 1 where it is chosen: a select of floats would be unrolled into branches
+            let mut mask = [0; N];
+            for i in 0..N {
+                mask[i] = if self.choice[i] >= light.start { u32::MAX } else { 0 };
+            }
+            self.take(light, &mask);
+            set(&mut self.probability, light.probability, &mask);
+        }
+    }
+
+    /// As [`crate::light::Lights::choose`] does in the tree's only node: by the interval in which each number lies.
+    #[inline(always)]
+    fn choose_by_place(&mut self, node: &Node, few: &[FewTriangles]) {
+        const MOST: usize = 8;
+        let few = &few[..few.len().min(MOST)];
+        let (mut sums, mut counts) = ([[0.0; N]; MOST], [[0; N]; MOST]);
+        let (mut all, mut count) = ([0.0; N], [0; N]);
+        for k in 0..few.len() {
+            for i in 0..N {
+                let importance = node.importance(k, self.origin.get(i));
+                all[i] += importance;
+                count[i] += u32::from(importance > 0.0);
+                (sums[k][i], counts[k][i]) = (all[i], count[i]);
+            }
+        }
+        let (mut fewer, most) = (0u32, few.len() as u32);
+        for i in 0..N {
+            let is_fewer = count[i] < most;
+            fewer += u32::from((i < self.len) & is_fewer & self.seen[i] & !self.passes[i]);
+        }
+        self.fewer = u64::from(fewer);
+        let (mut begin, mut numbers) = ([0; N], [0; N]);
+        for (k, light) in few.iter().enumerate() {
+            let mut mask = [0; N];
+            for i in 0..N {
+                // where none shines there are no numbers to choose by
+                let length = if count[i] > 0 { 1 << 32 } else { 0 };
+                let end = end((sums[k][i], all[i]), (counts[k][i], count[i]), length);
+                let number = u64::from(self.choice[i]);
+                let is_chosen = (number >= begin[i]) & (number < end);
+                numbers[i] = if is_chosen { end - begin[i] } else { numbers[i] };
+                mask[i] = if is_chosen { u32::MAX } else { 0 };
+                begin[i] = end;
+            }
+            self.take(light, &mask);
+        }
+        for i in 0..N {
+            self.probability[i] = probability(numbers[i]);
+        }
+    }
+
+    /// Takes a light where the mask's bits are 1.
+    #[inline(always)]
+    fn take(&mut self, FewTriangles { light, radiance, .. }: &FewTriangles, mask: &[u32; N]) {
+        // written out: of loops over vectors and their components the compiler makes gathers and scatters across these
+        set3(&mut self.light_p0, light.p0, mask);
+        set3(&mut self.light_e1, light.e1, mask);
+        set3(&mut self.light_e2, light.e2, mask);
+        set3(&mut self.light_normal, light.normal, mask);
+        set3(&mut self.radiance, *radiance, mask);
+        set(&mut self.light_area, light.area, mask);
+        set(&mut self.light_error, light.error, mask);
+    }
+
+    #[inline(always)]
+    pub(super) fn sample_lights(&mut self) {
+        for i in 0..N {
+            let light = TriangleLight {
+                p0: self.light_p0.get(i),
+                e1: self.light_e1.get(i),
+                e2: self.light_e2.get(i),
+                normal: self.light_normal.get(i),
+                area: self.light_area[i],
+                error: self.light_error[i],
+            };
+            let (d, tmax, pdf, ok) = light.sample_or_not(self.origin.get(i), [self.place[0][i], self.place[1][i]]);
+            self.light_d.set(i, d);
+            self.light_tmax[i] = tmax;
+            self.light_pdf[i] = pdf * self.probability[i];
+            self.lit[i] = ok & (self.probability[i] > 0.0);
+        }
+    }
+
+    /// Sources that are no triangles, one by one; and where nothing was chosen there is no light.
+    #[inline(always)]
+    pub(super) fn other_lights(&mut self, context: &Context) {
+        if context.lights.few_triangles().is_some() {
+            return;
+        }
+        let far_sky = context.lights.has_far_sky();
+        let (mut skies, mut lanes, mut count) = ([[0; 2]; N], [0u8; N], 0);
+        let mut probability = 0.0;
+        for i in 0..self.len {
+            let Some(choice) = self.chosen[i] else {
+                self.lit[i] = false;
+                continue;
+            };
+            if far_sky && context.lights.is_sky(choice) {
+                // all of one probability
+                probability = choice.probability;
+                (skies[count], lanes[count]) = ([self.place_bits[0][i], self.place_bits[1][i]], i as u8);
+                count += 1;
+                continue;
+            }
+            if context.lights.only_triangles() || context.lights.triangle(choice).is_some() {
+                continue;
+            }
+            let place = [self.place_bits[0][i], self.place_bits[1][i]];
+            let light = context.lights.sample_chosen(choice, self.origin.get(i), place);
+            self.take_light(context, i, light);
+        }
+        if count > 0 {
+            context.lights.sample_skies(probability, &skies[..count], |k, light| {
+                self.take_light(context, usize::from(lanes[k]) & (N - 1), light);
+            });
+        }
+    }
+
+    #[inline(always)]
+    fn take_light(&mut self, context: &Context, i: usize, light: Option<LightSample>) {
+        self.lit[i] = light.is_some();
+        if let Some(light) = light {
+            self.light_d.set(i, light.d);
+            self.light_tmax[i] = light.tmax;
+            self.light_pdf[i] = light.pdf;
+            self.radiance.set(i, context.radiance(&light));
+        }
+    }
+}
