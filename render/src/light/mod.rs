@@ -367,6 +367,16 @@ impl Lights {
         }
     }
 
+    /// A source that was chosen, if it is a sphere that shines evenly at a point outside it, and its radiance.
+    #[inline(always)]
+    pub(crate) fn sphere(&self, choice: Choice, o: Vec3) -> Option<(&SphereLight, Vec3)> {
+        let source = &self.sources[choice.source];
+        match &source.geometry {
+            Geometry::Sphere(s) if source.picture.is_none() && s.is_lit_outside(o) => Some((s, source.emission)),
+            _ => None,
+        }
+    }
+
     /// Whether every source is a triangle that emits evenly.
     #[inline(always)]
     pub(crate) fn only_triangles(&self) -> bool {

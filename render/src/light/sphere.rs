@@ -32,12 +32,14 @@ impl SphereLight {
     }
 
     /// Centre.
-    pub(super) fn center(&self) -> Vec3 {
+    #[inline(always)]
+    pub(crate) fn center(&self) -> Vec3 {
         self.center
     }
 
     /// Radius.
-    pub(super) fn radius(&self) -> f32 {
+    #[inline(always)]
+    pub(crate) fn radius(&self) -> f32 {
         self.radius
     }
 
@@ -62,20 +64,28 @@ impl SphereLight {
         if outside == self.flipped {
             return None;
         }
-        let errors = self.center.abs().max(o.abs()).max_element() * gamma(16);
-        if !outside {
-            let n = uniform(u);
-            let way = to_center + n * self.radius;
-            let t2 = way.length_squared();
-            let t = t2.sqrt();
-            let d = way / t;
-            let cos = n.dot(d);
-            if !(cos > 0.0) {
-                return None;
-            }
-            let slack = (errors + t * 2e-7) / cos + t * gamma(24);
-            return Some((d, (t - slack).max(0.0), t2 / (cos * self.area())));
+        if outside {
+            return Some(self.sample_outside(o, u));
         }
+        let n = uniform(u);
+        let way = to_center + n * self.radius;
+        let t2 = way.length_squared();
+        let t = t2.sqrt();
+        let d = way / t;
+        let cos = n.dot(d);
+        if !(cos > 0.0) {
+            return None;
+        }
+        let slack = (self.errors(o) + t * 2e-7) / cos + t * gamma(24);
+        Some((d, (t - slack).max(0.0), t2 / (cos * self.area())))
+    }
+
+    /// [`SphereLight::sample`] from a point outside: always a direction, without branches.
+    #[inline(always)]
+    pub(crate) fn sample_outside(&self, o: Vec3, u: [f32; 2]) -> (Vec3, f32, f32) {
+        let to_center = self.center - o;
+        let d2 = to_center.length_squared();
+        let r2 = self.radius * self.radius;
         let distance = d2.sqrt();
         let cone = self.cone(d2);
         let below = u[0] * cone; // 1 - cos of the angle to the axis
@@ -89,8 +99,20 @@ impl SphereLight {
         let half2 = (r2 - d2 * sin2).max(0.0);
         let uncertain = (half2 + r2 * gamma(16) + distance * self.radius * 4e-7).sqrt();
         let t = distance * cos - uncertain;
-        let slack = errors + distance * gamma(24);
-        Some((d, (t - slack).max(0.0), 1.0 / (2.0 * PI * cone)))
+        let slack = self.errors(o) + distance * gamma(24);
+        (d, (t - slack).max(0.0), 1.0 / (2.0 * PI * cone))
+    }
+
+    /// Whether a point sees the side that emits, from outside.
+    #[inline(always)]
+    pub(crate) fn is_lit_outside(&self, o: Vec3) -> bool {
+        !self.flipped & ((self.center - o).length_squared() > self.radius * self.radius)
+    }
+
+    /// Of positions, along a ray.
+    #[inline(always)]
+    fn errors(&self, o: Vec3) -> f32 {
+        self.center.abs().max(o.abs()).max_element() * gamma(16)
     }
 
     /// Outward unit normal where a direction from `o`, which [`SphereLight::sample`] gave, meets it first on the side that emits.

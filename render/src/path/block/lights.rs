@@ -1,8 +1,9 @@
 //! Choosing lights and points on them.
 
 use super::{Block, N, set, set3};
-use crate::light::{Few, FewTriangles, LightSample, Node, TriangleLight, end, probability};
+use crate::light::{Few, FewTriangles, LightSample, Node, SphereLight, TriangleLight, end, probability};
 use crate::path::Context;
+use crate::path::vertex::select;
 
 impl Block {
     #[inline(always)]
@@ -13,6 +14,7 @@ impl Block {
             None => {}
         }
         for i in 0..self.len {
+            self.is_ball[i] = false;
             // where a vertex passes there is no point to choose for
             let (chosen, fewer) =
                 if self.passes[i] { (None, false) } else { context.lights.choose(self.origin.get(i), self.choice[i]) };
@@ -20,7 +22,16 @@ impl Block {
             self.fewer += u64::from(fewer & self.seen[i]);
             self.chosen[i] = chosen;
             let Some(choice) = self.chosen[i] else { continue };
-            let Some((triangle, radiance)) = context.lights.triangle(choice) else { continue };
+            self.probability[i] = choice.probability;
+            let Some((triangle, radiance)) = context.lights.triangle(choice) else {
+                if let Some((sphere, radiance)) = context.lights.sphere(choice, self.origin.get(i)) {
+                    self.is_ball[i] = true;
+                    self.light_center.set(i, sphere.center());
+                    self.light_radius[i] = sphere.radius();
+                    self.radiance.set(i, radiance);
+                }
+                continue;
+            };
             self.light_p0.set(i, triangle.p0);
             self.light_e1.set(i, triangle.e1);
             self.light_e2.set(i, triangle.e2);
@@ -28,7 +39,6 @@ impl Block {
             self.light_area[i] = triangle.area;
             self.light_error[i] = triangle.error;
             self.radiance.set(i, radiance);
-            self.probability[i] = choice.probability;
         }
     }
 
@@ -119,12 +129,30 @@ impl Block {
         }
     }
 
-    /// Sources that are no triangles, one by one; and where nothing was chosen there is no light.
+    /// Spheres that are seen from outside, where there is one.
+    #[inline(always)]
+    fn sample_balls(&mut self) {
+        if !self.is_ball[..self.len].contains(&true) {
+            return;
+        }
+        for i in 0..N {
+            let sphere = SphereLight::new(self.light_center.get(i).to_array(), self.light_radius[i], false);
+            let (d, tmax, pdf) = sphere.sample_outside(self.origin.get(i), [self.place[0][i], self.place[1][i]]);
+            let yes = self.is_ball[i];
+            self.light_d.set(i, select(yes, d, self.light_d.get(i)));
+            self.light_tmax[i] = if yes { tmax } else { self.light_tmax[i] };
+            self.light_pdf[i] = if yes { pdf * self.probability[i] } else { self.light_pdf[i] };
+            self.lit[i] |= yes;
+        }
+    }
+
+    /// Sources that are neither, one by one; and where nothing was chosen there is no light.
     #[inline(always)]
     pub(super) fn other_lights(&mut self, context: &Context) {
         if context.lights.few_triangles().is_some() {
             return;
         }
+        self.sample_balls();
         let far_sky = context.lights.has_far_sky();
         let (mut skies, mut lanes, mut count) = ([[0; 2]; N], [0u8; N], 0);
         let mut probability = 0.0;
@@ -140,7 +168,7 @@ impl Block {
                 count += 1;
                 continue;
             }
-            if context.lights.only_triangles() || context.lights.triangle(choice).is_some() {
+            if self.is_ball[i] || context.lights.only_triangles() || context.lights.triangle(choice).is_some() {
                 continue;
             }
             let place = [self.place_bits[0][i], self.place_bits[1][i]];
