@@ -8,8 +8,9 @@ use std::sync::Arc;
 
 use anyhow::Context;
 use clap::Args;
+use rayherd_api::ByteSize;
 use rayherd_herd::store::{
-    BlockStore, DirectoryStore, Prefixed, RetryPolicy, Retrying, S3Settings, S3Store, SceneObjects, Spilling,
+    BlockStore, Caching, DirectoryStore, Prefixed, RetryPolicy, Retrying, S3Settings, S3Store, SceneObjects, Spilling,
     StoreError,
 };
 use rayherd_scene::objects::{DirectoryObjects, ObjectStore};
@@ -29,6 +30,9 @@ pub struct S3Options {
     /// keys come from AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY
     #[arg(long, value_name = "URL")]
     s3_endpoint: Option<String>,
+    /// Keep what is read of a prepared scene in S3 in a temporary folder too, up to so many bytes: what memory drops is fetched once
+    #[arg(long, value_name = "SIZE")]
+    s3_cache: Option<ByteSize>,
 }
 
 /// An open store.
@@ -57,11 +61,22 @@ impl Store {
                 anyhow::Error::new(error).context(format!("cannot open {address} at {server} ({remedy})"))
             })?;
             let blocks: Arc<dyn BlockStore> = Arc::new(Retrying::new(Arc::new(bucket), RetryPolicy::default()));
-            let objects = Arc::new(SceneObjects::new(blocks.clone(), runtime.handle().clone())?);
+            let read: Arc<dyn BlockStore> = match s3.s3_cache {
+                None => blocks.clone(),
+                Some(size) => {
+                    let near = Arc::new(Spilling::new(0, interrupt::remove_at_end));
+                    // what is named by its hash never changes
+                    let keeps = |key: &str| key.starts_with("objects/");
+                    Arc::new(Caching::new(blocks.clone(), near, size.bytes(), keeps))
+                }
+            };
+            let objects = Arc::new(SceneObjects::new(read, runtime.handle().clone())?);
             return Ok(Store { blocks, objects, runtime });
         }
-        if s3.s3_endpoint.is_some() {
-            return Err(Mistake(format!("--s3-endpoint is for a store s3://bucket/prefix, not for {address}")).into());
+        for (flag, given) in [("--s3-endpoint", s3.s3_endpoint.is_some()), ("--s3-cache", s3.s3_cache.is_some())] {
+            if given {
+                return Err(Mistake(format!("{flag} is for a store s3://bucket/prefix, not for {address}")).into());
+            }
         }
         if address.is_empty() || address.contains("://") {
             return Err(Mistake(format!("{address:?} is no store: name a folder, or s3://bucket/prefix")).into());

@@ -120,6 +120,35 @@ fn a_bucket_serves_as_a_folder_does() {
     assert!(gc.code == 0 && !gc.out.contains(": 0 objects deleted"), "{}{}", gc.out, gc.err);
 }
 
+/// A memory of one split of three: each is read again and again, over the network or from the cache; the file is the same.
+#[test]
+fn what_memory_drops_is_fetched_once_with_a_cache() {
+    let server = Server::start();
+    let (store, scene) = (format!("s3://{BUCKET}/cached"), scene());
+    let folder = tempfile::tempdir().unwrap();
+    let folder = folder.path();
+    let small = ["--nodes", "1", "--slots", "1", "--memory", "2000", "--strategy", "demand-driven"];
+    let asked = |seed: &str, output: &str, more: &[&str]| {
+        let before = server.server.requests().0;
+        let more = [&small, &["--store", &store, "--seed", seed][..], more].concat();
+        let run = server.run(folder, &render(&scene, "4", output, &more));
+        assert_eq!(run.code, 0, "{}", run.err);
+        server.server.requests().0 - before
+    };
+    // prepares
+    asked("1", "a.exr", &[]);
+    let without = asked("2", "b.exr", &[]);
+    let with = asked("3", "c.exr", &["--s3-cache", "1MiB"]);
+    println!("{without} requests without, {with} with a cache");
+    assert!(with + 30 < without, "{with} of {without}");
+    let plain = common::rayherd(folder, &render(&scene, "4", "d.exr", &["--seed", "3"]));
+    assert_eq!(plain.code, 0, "{}", plain.err);
+    assert!(fs::read(folder.join("c.exr")).unwrap() == fs::read(folder.join("d.exr")).unwrap());
+    let folder_store = ["--store", "s", "--s3-cache", "1MiB"];
+    let refused = common::rayherd(folder, &render(&scene, "4", "e.exr", &folder_store));
+    assert_mistake(&refused, &["--s3-cache", "s3://bucket/prefix"]);
+}
+
 /// `tests/minio/run` starts one and names it: `RAYHERD_S3_ENDPOINT`, `RAYHERD_S3_BUCKET` and the keys.
 #[test]
 #[ignore = "needs an S3 server: tests/minio/run"]

@@ -1,5 +1,6 @@
 //! Where blocks, ray groups and film parts live: one trait, several backends, layers around them.
 
+mod caching;
 #[cfg(any(test, feature = "testing"))]
 pub mod conformance;
 mod counting;
@@ -23,6 +24,7 @@ use std::path::Path;
 use async_trait::async_trait;
 use bytes::Bytes;
 
+pub use caching::{CacheCounts, Caching};
 pub use counting::{Counters, Counting, kind_of_key};
 pub use directory::DirectoryStore;
 pub use faulty::{FaultPlan, Faulty, Injected};
