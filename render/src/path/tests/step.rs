@@ -224,7 +224,7 @@ fn same(a: &Outcome, b: &Outcome) {
 }
 
 fn check_batches(scene: &Scene, split: u32, skips: Skips) {
-    let frame = Frame { split, ..cornell::frame(16) };
+    let frame = Frame { split, rr_depth: 2, ..cornell::frame(16) };
     let (world, lights) = (scene.world(), scene.lights());
     let context = Context::new(&world, &lights, &frame).with(&scene.tiles).skipping(skips);
     let mut rays: Vec<PathRay> = (0..256).map(|p| camera_ray(&frame, p, 3)).collect();
