@@ -1,37 +1,25 @@
 //! JPEG.
 
 use std::fs::File;
-use std::io::{BufReader, Cursor, Read};
+use std::io::BufReader;
 
-use rayherd_render::texture::{Bitmap, Texel};
-use zune_jpeg::JpegDecoder;
-use zune_jpeg::zune_core::colorspace::ColorSpace;
-use zune_jpeg::zune_core::options::DecoderOptions;
+use jpeg_decoder::{Decoder, Error, PixelFormat};
+use rayherd_render::texture::Texel;
 
 use super::{Header, Image, check};
 
-type Decoder = JpegDecoder<Cursor<Vec<u8>>>;
-
-fn open(mut file: BufReader<File>, raw: bool) -> Result<(Decoder, Header), String> {
-    let mut bytes = Vec::new();
-    file.read_to_end(&mut bytes).map_err(|e| format!("cannot be read: {e}"))?;
-    // no vector code: the same bytes on every machine; strict: a file that is cut off is an error, not grey below
-    let options = DecoderOptions::default()
-        .set_use_unsafe(false)
-        .set_strict_mode(true)
-        .set_max_width(Bitmap::MOST as usize)
-        .set_max_height(Bitmap::MOST as usize);
-    let mut decoder = JpegDecoder::new_with_options(Cursor::new(bytes), options);
-    decoder.decode_headers().map_err(|e| format!("cannot be read as JPEG: {e:?}"))?;
-    let grey = decoder.input_colorspace() == Some(ColorSpace::Luma);
-    let out = if grey { ColorSpace::Luma } else { ColorSpace::RGB };
-    decoder.set_options(options.jpeg_set_out_colorspace(out));
-    let (width, height) = decoder.dimensions().ok_or("says no size")?;
-    let header = Header {
-        size: [width as u32, height as u32],
-        channels: if grey { 1 } else { 3 },
-        texel: if raw { Texel::Linear8 } else { Texel::Srgb8 },
+fn open(file: BufReader<File>, raw: bool) -> Result<(Decoder<BufReader<File>>, Header), String> {
+    let mut decoder = Decoder::new(file);
+    decoder.read_info().map_err(said)?;
+    let info = decoder.info().ok_or("says no size")?;
+    let channels = match info.pixel_format {
+        PixelFormat::L8 => 1,
+        PixelFormat::RGB24 => 3,
+        PixelFormat::L16 => return Err("has 16 bits a sample: save it as PNG or EXR".into()),
+        PixelFormat::CMYK32 => return Err("has four colours, for print: save it as RGB".into()),
     };
+    let size = [info.width.into(), info.height.into()];
+    let header = Header { size, channels, texel: if raw { Texel::Linear8 } else { Texel::Srgb8 } };
     check(&header)?;
     Ok((decoder, header))
 }
@@ -42,6 +30,12 @@ pub(super) fn header(file: BufReader<File>, raw: bool) -> Result<Header, String>
 
 pub(super) fn read(file: BufReader<File>, raw: bool) -> Result<Image, String> {
     let (mut decoder, header) = open(file, raw)?;
-    let bytes = decoder.decode().map_err(|e| format!("cannot be read to its end: {e:?}"))?;
-    Ok(Image { header, bytes })
+    Ok(Image { bytes: decoder.decode().map_err(said)?, header })
+}
+
+fn said(error: Error) -> String {
+    match error {
+        Error::Io(e) if e.kind() == std::io::ErrorKind::UnexpectedEof => "is cut off".into(),
+        e => format!("cannot be read as JPEG: {e}"),
+    }
 }
