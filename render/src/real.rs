@@ -11,7 +11,7 @@ mod numbers {
     pub use core::primitive::f32;
 
     pub use glam::{Vec3, Vec4};
-    pub use libm::{asinf as asin, atan2f as atan2, expm1f as expm1, logf as log, powf as pow};
+    pub use libm::{asinf as asin, expm1f as expm1, logf as log, powf as pow};
 
     /// A float's bits as a signed number.
     pub type Signed = i32;
@@ -33,7 +33,7 @@ mod numbers {
     pub use core::f64::consts;
 
     pub use glam::{DVec3 as Vec3, DVec4 as Vec4};
-    pub use libm::{asin, atan2, expm1, log, pow};
+    pub use libm::{asin, expm1, log, pow};
 
     #[allow(non_camel_case_types)] // stands in for the primitive of this name
     pub type f32 = f64;

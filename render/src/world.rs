@@ -3,9 +3,10 @@
 use serde::{Deserialize, Serialize};
 
 use crate::material::Material;
+use crate::math::atan2;
 use crate::ray::PrimId;
 use crate::real::consts::FRAC_1_PI;
-use crate::real::{Vec3, atan2, f32};
+use crate::real::{Vec3, f32};
 use crate::texture::{At, Bitmap, Texture};
 
 /// Materials, textures, shapes, emitters and sky of a scene, in recentred f32 coordinates.

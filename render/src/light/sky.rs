@@ -128,27 +128,18 @@ impl Sky {
             numbers.iter().enumerate().for_each(|(i, u)| give(i, self.sample(*u)));
             return;
         };
-        let mut parts = [Part::Sun(Vec3::ZERO); MANY];
-        let mut rows = [(0, 0.0); MANY];
+        let mut parts = [(Part::Sun(Vec3::ZERO), Default::default()); MANY];
         let mut places = [Place::default(); MANY];
         for (k, some) in numbers.chunks(MANY).enumerate() {
-            for i in 0..some.len() {
-                parts[i] = self.choose(some[i]);
-                if let Part::Dome(u) = parts[i] {
-                    rows[i] = map.choose_row(u[0]);
-                    map.foresee_guide(rows[i].0, u[1]);
-                }
-            }
-            for i in 0..some.len() {
-                if let Part::Dome(u) = parts[i] {
-                    map.foresee_columns(rows[i].0, u[1]);
-                }
+            for (part, numbers) in parts.iter_mut().zip(some) {
+                let chosen = self.choose(*numbers);
+                *part = (chosen, if let Part::Dome(u) = chosen { map.choose(u) } else { Default::default() });
             }
             let mut directions = [Vec3::ZERO; MANY];
             for i in 0..some.len() {
-                directions[i] = match parts[i] {
-                    Part::Sun(d) => d,
-                    Part::Dome(u) => self.dome.snapped(map.sample_row(rows[i], u[1])),
+                directions[i] = match &parts[i] {
+                    (Part::Sun(d), _) => *d,
+                    (Part::Dome(u), cell) => self.dome.snapped(map.direction(cell, *u)),
                 };
                 places[i] = self.dome.place(directions[i]);
                 map.foresee(&places[i]);

@@ -16,7 +16,7 @@ pub use dir::UnitDir;
 pub(crate) use exponential::{erf_up, exp_down, ln};
 pub use frame::Basis;
 pub use offset::{Position, gamma, offset_origin};
-pub use trig::{concentric_disk, sincos_turn};
+pub use trig::{atan2, concentric_disk, sincos_turn};
 
 /// Luminance of linear Rec. 709.
 pub fn luminance(c: Vec3) -> f32 {

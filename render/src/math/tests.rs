@@ -102,6 +102,24 @@ fn sine_and_cosine() {
     assert!(worst < 2e-7, "{worst}");
 }
 
+#[test]
+fn angles() {
+    let mut worst = 0.0f64;
+    let mut look = |y: f32, x: f32| {
+        worst = worst.max((f64::from(atan2(y, x)) - libm::atan2(f64::from(y), f64::from(x))).abs());
+    };
+    for i in 0..=1_000_000 {
+        let x = 2.0 * std::f64::consts::PI * f64::from(i) / 1e6;
+        look(libm::sin(x) as f32, libm::cos(x) as f32);
+    }
+    let odd = [0.0, -0.0, 1.0, -1.0, 1e-30, -1e-30, 1e-44, -1e-44, 1e30, -1e30, 0.414_213_57, 0.414_213_5];
+    for y in odd {
+        odd.iter().for_each(|x| look(y, *x));
+    }
+    println!("worst {worst}");
+    assert!(worst < 4e-7, "{worst}");
+}
+
 /// The disk is covered evenly: equal counts in bins of equal area by radius and angle.
 #[test]
 fn disk_is_uniform() {

@@ -1,4 +1,4 @@
-//! Sine and cosine of fractions of a turn, and the disk map that needs them: own polynomials, plain f32 operations.
+//! Sine and cosine of fractions of a turn, the disk map that needs them, and the angle of a vector: own polynomials, plain f32 operations.
 
 use crate::real::consts::{FRAC_PI_2, FRAC_PI_4};
 use crate::real::f32;
@@ -29,6 +29,30 @@ pub fn sincos_turn(u: f32) -> (f32, f32) {
     let (a, b) = if q & 1 == 0 { (s, c) } else { (c, s) };
     (if q & 2 == 0 { a } else { -a }, if (q + 1) & 2 == 0 { b } else { -b })
 }
+
+/// The angle of (x, y) in (-pi, pi], absolute error below 4e-7; a zero has its sign, as in C. Without branches.
+#[cfg(not(feature = "double"))]
+#[inline(always)]
+pub fn atan2(y: f32, x: f32) -> f32 {
+    use crate::real::consts::PI;
+    const TAN_EIGHTH: f32 = 0.414_213_57;
+    let (a, b) = (y.abs(), x.abs());
+    let (low, high) = if a > b { (b, a) } else { (a, b) };
+    // from an eighth of a turn down to a sixteenth
+    let far = low > TAN_EIGHTH * high;
+    let (up, down) = if far { (low - high, low + high) } else { (low, high) };
+    let t = up / if down == 0.0 { 1.0 } else { down };
+    let z = t * t;
+    // of Cephes' atanf (Moshier 1992): 2e-8 of it to tan(pi / 8)
+    let series = -3.333_295e-1 + z * (1.997_771_1e-1 + z * (-1.387_768_6e-1 + z * 8.053_744_5e-2));
+    let r = t + t * z * series + if far { FRAC_PI_4 } else { 0.0 };
+    let r = if a > b { FRAC_PI_2 - r } else { r };
+    let r = if x.is_sign_negative() { PI - r } else { r };
+    r.copysign(y)
+}
+
+#[cfg(feature = "double")]
+pub use libm::atan2;
 
 /// The unit square onto the unit disk, keeping areas and strata (Shirley and Chiu 1997).
 #[inline(always)]
