@@ -10,6 +10,7 @@ pub mod plan;
 pub mod remote;
 pub mod report;
 pub mod resident;
+mod shapes;
 pub mod store;
 pub mod task;
 #[cfg(test)]

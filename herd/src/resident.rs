@@ -12,6 +12,7 @@ use rayherd_render::world::Primitive;
 use rayherd_scene::grid::SplitSet;
 
 use crate::job::{JobError, PreparedScene};
+use crate::shapes::Shapes;
 
 /// Gives a split's objects to whoever loads it, and counts them.
 pub trait Blocks {
@@ -141,53 +142,27 @@ impl Resident {
     }
 }
 
-/// Runs of a shape that are searched rather than looked up one by one: their starts stay in the first cache, where a number per
-/// primitive misses the last one at each hit.
-const RUNS: usize = 256;
-
-/// Attributes of a split, with a short way to a primitive's shape. They take no more memory than the object: runs of shapes as there,
-/// or a number for each primitive when these are fewer bytes.
+/// Attributes of a split. They take no more memory than the object.
 struct Attributes {
-    /// Without shapes where runs serve.
+    /// Without shapes.
     block: AttributeBlock,
-    /// First primitive of each run but the first.
-    starts: Option<Vec<u32>>,
-    /// Shape of each run.
-    shapes: Vec<u32>,
+    shapes: Shapes,
 }
 
 impl Attributes {
     fn new(mut block: AttributeBlock) -> Self {
-        let runs = block.shapes.chunk_by(|a, b| a == b).count();
-        if runs > RUNS && 2 * runs > block.shapes.len() {
-            return Attributes { block, starts: None, shapes: Vec::new() };
-        }
-        let (mut starts, mut shapes) = (Vec::with_capacity(runs.saturating_sub(1)), Vec::with_capacity(runs));
-        let mut at = 0;
-        for run in block.shapes.chunk_by(|a, b| a == b) {
-            shapes.push(run[0]);
-            at += run.len();
-            if at < block.shapes.len() {
-                starts.push(at as u32);
-            }
-        }
-        block.shapes = Vec::new();
-        Attributes { block, starts: Some(starts), shapes }
+        let shapes = Shapes::new(std::mem::take(&mut block.shapes));
+        Attributes { block, shapes }
     }
 
     fn bytes(&self) -> usize {
-        let AttributeBlock { shapes, normals, uvs, attributes } = &self.block;
-        let starts = self.starts.as_ref().map_or(0, Vec::capacity);
-        let floats = 36 * (normals.capacity() + attributes.capacity()) + 24 * uvs.capacity();
-        4 * (shapes.capacity() + starts + self.shapes.capacity()) + floats
+        let AttributeBlock { shapes: _, normals, uvs, attributes } = &self.block;
+        self.shapes.bytes() + 36 * (normals.capacity() + attributes.capacity()) + 24 * uvs.capacity()
     }
 
     #[inline(always)]
     fn shape(&self, local: usize) -> u32 {
-        match &self.starts {
-            Some(starts) => self.shapes[starts.partition_point(|&s| s as usize <= local)],
-            None => self.block.shapes[local],
-        }
+        self.shapes.get(local)
     }
 
     #[inline(always)]
@@ -257,9 +232,7 @@ impl Surfaces for ResidentSurfaces<'_> {
             prefetch(first);
             prefetch(last);
         }
-        if let Some(shape) = block.shapes.get(local) {
-            prefetch(shape);
-        }
+        attributes.shapes.foresee(local);
     }
     fn prim(&self, _index: usize, hit: &Hit) -> PrimId {
         self.resident.forest.prim_id(hit.prim)
@@ -439,9 +412,9 @@ mod tests {
     use super::*;
 
     #[test]
-    fn shapes_by_runs_are_those_by_number() {
+    fn attributes_take_no_more_than_their_object() {
         let runs = |n: usize, len: usize| (0..n * len).map(|i| (i / len) as u32 % 7).collect::<Vec<u32>>();
-        let kinds = [vec![], vec![5], vec![1, 1, 2], runs(RUNS, 3), runs(RUNS + 1, 1), runs(1000, 2), runs(1000, 9)];
+        let kinds = [vec![], vec![5], vec![1, 1, 2], runs(256, 3), runs(257, 1), runs(1000, 2), runs(1000, 9)];
         for shapes in kinds {
             let block = AttributeBlock { shapes: shapes.clone(), ..Default::default() };
             // what the object takes is what `--memory` counts

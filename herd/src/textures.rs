@@ -174,7 +174,7 @@ type AtHand = (u32, Arc<[u8]>);
 pub struct TaskTextures<'a> {
     cache: &'a TileCache,
     from: &'a dyn Tiles,
-    /// Tiles by number modulo their count.
+    /// Tiles by number modulo their count, a power of two.
     at_hand: RefCell<Vec<Option<AtHand>>>,
     error: RefCell<Option<JobError>>,
 }
@@ -186,7 +186,9 @@ impl<'a> TaskTextures<'a> {
         let largest = scene.manifest.tiles.iter().map(|t| t.bytes).max().unwrap_or(1).max(1);
         // half of the budget, at most, is in tasks' hands: these tiles are not dropped
         let share = cache.budget / 2 / largest / u64::from(tasks.max(1));
-        let count = share.clamp(1, MOST_AT_HAND).min(tiles.max(1));
+        // a power of two, so that a look-up finds its place without a division
+        let count = share.clamp(1, MOST_AT_HAND).min(tiles.max(1).next_power_of_two());
+        let count = 1 << count.ilog2();
         let at_hand = RefCell::new(vec![None; count as usize]);
         TaskTextures { cache, from, at_hand, error: RefCell::default() }
     }
@@ -209,7 +211,7 @@ impl Textures for TaskTextures<'_> {
     #[inline]
     fn at_hand(&self, number: u32) -> Option<Ref<'_, [u8]>> {
         Ref::filter_map(self.at_hand.borrow(), |tiles| {
-            let held = tiles[number as usize % tiles.len()].as_ref();
+            let held = tiles[number as usize & (tiles.len() - 1)].as_ref();
             held.filter(|(n, _)| *n == number).map(|(_, tile)| &**tile)
         })
         .ok()
@@ -224,7 +226,7 @@ impl TaskTextures<'_> {
             return None;
         }
         // what lay here is let go first, so that there is room
-        let place = number as usize % self.at_hand.borrow().len();
+        let place = number as usize & (self.at_hand.borrow().len() - 1);
         self.at_hand.borrow_mut()[place] = None;
         match self.cache.get(number, self.from) {
             Ok(tile) => self.at_hand.borrow_mut()[place] = Some((number, tile)),

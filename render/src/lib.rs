@@ -32,4 +32,5 @@ pub mod skip;
 #[cfg(test)]
 mod testing;
 pub mod texture;
+mod wide;
 pub mod world;

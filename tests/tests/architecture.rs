@@ -252,8 +252,10 @@ fn unsafe_stays_in_named_modules() {
     let named = [
         "render/src/bvh/arena.rs",
         "render/src/bvh/trace/",
+        "render/src/light/wide.rs",
         "render/src/path/wide.rs",
         "render/src/memory.rs",
+        "render/src/wide.rs",
         "scene/src/import/spill.rs",
     ];
     let mut files = Vec::new();

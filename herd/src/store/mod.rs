@@ -107,7 +107,9 @@ pub enum StoreError {
         message: String,
     },
     /// No room: free some.
-    #[error("{store}: no room for {key} ({bytes} bytes)")]
+    #[error(
+        "{store}: no room for {key} ({bytes} bytes): free some or add some, then start again; what is there is used"
+    )]
     Full {
         /// Which store.
         store: String,

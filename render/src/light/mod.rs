@@ -11,6 +11,7 @@
 mod beam;
 mod bounds;
 mod map;
+mod picture;
 mod sky;
 mod sphere;
 mod sun;
@@ -20,6 +21,7 @@ mod tree;
 #[cfg(test)]
 mod tree_tests;
 mod triangle;
+mod wide;
 
 use std::sync::Arc;
 

@@ -6,9 +6,10 @@
 use std::sync::Arc;
 
 use super::map::Place;
+use super::picture::{Directions, MANY, Picture, snapped};
 use super::sun::Sun;
-use super::{SkyMap, sphere};
-use crate::math::{UnitDir, luminance};
+use super::{SkyMap, sphere, wide};
+use crate::math::luminance;
 use crate::real::{Vec3, f32};
 use crate::world::{Environment, World};
 
@@ -16,8 +17,6 @@ use crate::world::{Environment, World};
 const WHOLE: u64 = 1 << 32;
 /// Neither sun nor dome is chosen less often than this where there are both: whichever is the brighter may be out of sight.
 const LEAST: f64 = 0.125;
-/// So many are sampled together: as many lines of memory as a processor fetches at a time, about.
-const MANY: usize = 32;
 
 /// The light that comes from infinitely far away, all around.
 #[derive(Clone, Debug)]
@@ -35,15 +34,8 @@ enum Dome {
     None,
     /// The same from everywhere, sampled evenly.
     Constant(Vec3),
-    /// A picture, turned.
-    Map {
-        map: Arc<SkyMap>,
-        scale: f32,
-        /// Rows of the rotation from the world's directions to the map's.
-        to_map: [Vec3; 3],
-        /// Its lower half is dark.
-        upper: bool,
-    },
+    /// A picture.
+    Map(Picture),
 }
 
 impl Sky {
@@ -75,7 +67,7 @@ impl Sky {
 
     /// Whether there is a picture, which memory holds and no cache: then many are sampled, or looked up, sooner than one by one.
     pub(super) fn is_far(&self) -> bool {
-        matches!(self.dome, Dome::Map { .. })
+        matches!(self.dome, Dome::Map(_))
     }
 
     /// Radiance from a unit direction, and with which density in solid angle [`Sky::sample`] gives it.
@@ -86,14 +78,17 @@ impl Sky {
 
     /// [`Sky::look_up`] of many directions, given with their index: all are asked for before the first is read.
     pub(super) fn look_up_many(&self, directions: &[Vec3], mut give: impl FnMut(usize, (Vec3, f32))) {
-        let mut places = [Place::default(); MANY];
+        let Dome::Map(picture) = &self.dome else {
+            directions.iter().enumerate().for_each(|(i, d)| give(i, self.look_up(*d)));
+            return;
+        };
+        let mut many = Directions::new();
         for (k, part) in directions.chunks(MANY).enumerate() {
-            for (place, d) in places.iter_mut().zip(part) {
-                *place = self.dome.place(*d);
-                self.dome.foresee(place);
-            }
-            for (i, (place, d)) in places.iter().zip(part).enumerate() {
-                give(k * MANY + i, self.look_up_at(*d, *place));
+            part.iter().enumerate().for_each(|(i, d)| many.set(i, *d));
+            wide::place(&mut many, picture);
+            (0..part.len()).for_each(|i| picture.map.foresee(&many.place_of(i)));
+            for (i, d) in part.iter().enumerate() {
+                give(k * MANY + i, self.look_up_at(*d, many.place_of(i)));
             }
         }
     }
@@ -124,29 +119,35 @@ impl Sky {
 
     /// [`Sky::sample`] by many pairs of numbers, given with their index: what a step reads is asked for by the step before, for all.
     pub(super) fn sample_many(&self, numbers: &[[u32; 2]], mut give: impl FnMut(usize, Option<(Vec3, Vec3, f32)>)) {
-        let Dome::Map { map, .. } = &self.dome else {
+        let Dome::Map(picture) = &self.dome else {
             numbers.iter().enumerate().for_each(|(i, u)| give(i, self.sample(*u)));
             return;
         };
         let mut parts = [(Part::Sun(Vec3::ZERO), Default::default()); MANY];
-        let mut places = [Place::default(); MANY];
+        let mut many = Directions::new();
         for (k, some) in numbers.chunks(MANY).enumerate() {
             for (part, numbers) in parts.iter_mut().zip(some) {
                 let chosen = self.choose(*numbers);
-                *part = (chosen, if let Part::Dome(u) = chosen { map.choose(u) } else { Default::default() });
+                *part = (chosen, if let Part::Dome(u) = chosen { picture.map.choose(u) } else { Default::default() });
             }
-            let mut directions = [Vec3::ZERO; MANY];
-            for i in 0..some.len() {
-                directions[i] = match &parts[i] {
-                    (Part::Sun(d), _) => *d,
-                    (Part::Dome(u), cell) => self.dome.snapped(map.direction(cell, *u)),
-                };
-                places[i] = self.dome.place(directions[i]);
-                map.foresee(&places[i]);
+            let parts = &parts[..some.len()];
+            for (i, (part, cell)) in parts.iter().enumerate() {
+                if let Part::Dome(u) = part {
+                    many.set_spot(i, picture.map.spot(cell, *u));
+                }
             }
-            for i in 0..some.len() {
-                let (radiance, pdf) = self.look_up_at(directions[i], places[i]);
-                give(k * MANY + i, (pdf > 0.0).then_some((directions[i], radiance, pdf)));
+            wide::turn(&mut many, picture);
+            for (i, (part, _)) in parts.iter().enumerate() {
+                if let Part::Sun(d) = part {
+                    many.set(i, *d);
+                }
+            }
+            wide::place(&mut many, picture);
+            (0..parts.len()).for_each(|i| picture.map.foresee(&many.place_of(i)));
+            for i in 0..parts.len() {
+                let d = many.get(i);
+                let (radiance, pdf) = self.look_up_at(d, many.place_of(i));
+                give(k * MANY + i, (pdf > 0.0).then_some((d, radiance, pdf)));
             }
         }
     }
@@ -183,7 +184,7 @@ impl Dome {
                 Dome::Constant(Vec3::from(*radiance))
             }
             (Some(&Environment::Map { scale, to_map, upper }), Some(map)) if map.shines() && scale > 0.0 => {
-                Dome::Map { map, scale, to_map: to_map.map(Vec3::from), upper }
+                Dome::Map(Picture { map, scale, to_map: to_map.map(Vec3::from), upper })
             }
             _ => Dome::None,
         }
@@ -193,7 +194,7 @@ impl Dome {
         match self {
             Dome::None => None,
             Dome::Constant(radiance) => Some(*radiance),
-            Dome::Map { map, scale, .. } => Some(map.mean() * *scale),
+            Dome::Map(picture) => Some(picture.mean()),
         }
     }
 
@@ -201,15 +202,8 @@ impl Dome {
     #[inline]
     fn place(&self, d: Vec3) -> Place {
         match self {
-            Dome::Map { map, to_map: [x, y, z], .. } => map.place(Vec3::new(x.dot(d), y.dot(d), z.dot(d))),
+            Dome::Map(picture) => picture.place(d),
             _ => Place::default(),
-        }
-    }
-
-    #[inline]
-    fn foresee(&self, place: &Place) {
-        if let Dome::Map { map, .. } = self {
-            map.foresee(place);
         }
     }
 
@@ -219,19 +213,7 @@ impl Dome {
         match self {
             Dome::None => (Vec3::ZERO, 0.0),
             Dome::Constant(radiance) => (*radiance, sphere::UNIFORM_PDF),
-            Dome::Map { map, scale, to_map: [_, y, _], upper } => {
-                let (radiance, pdf) = map.at(place);
-                (if *upper && y.dot(d) < 0.0 { Vec3::ZERO } else { radiance * *scale }, pdf)
-            }
-        }
-    }
-
-    /// A direction of the picture, turned, as it travels.
-    #[inline]
-    fn snapped(&self, d: Vec3) -> Vec3 {
-        match self {
-            Dome::Map { to_map: [x, y, z], .. } => snapped(*x * d.x + *y * d.y + *z * d.z),
-            _ => d,
+            Dome::Map(picture) => picture.look_up(d, place),
         }
     }
 
@@ -241,14 +223,9 @@ impl Dome {
         match self {
             Dome::None => None,
             Dome::Constant(_) => Some(snapped(sphere::uniform(u.map(crate::math::unit)))),
-            Dome::Map { map, .. } => Some(self.snapped(map.sample(u))),
+            Dome::Map(picture) => Some(picture.sample(u)),
         }
     }
-}
-
-#[inline]
-fn snapped(d: Vec3) -> Vec3 {
-    Vec3::from(UnitDir::encode(d.to_array()).decode())
 }
 
 #[cfg(test)]

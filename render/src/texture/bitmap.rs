@@ -90,8 +90,9 @@ impl Bitmap {
         match self.filter {
             Filter::Nearest => {
                 let at = self.place(uv, 0.0);
-                let [x, y] = std::array::from_fn(|a| self.wrapped(at[a].floor() as i32, a));
-                self.four(tiles, [x, x], [y, y])[0]
+                let p = std::array::from_fn(|a| self.wrapped(down(at[a]), a));
+                let Some(texels) = tiles.tile(self.tile_at(p)) else { return Vec3::ZERO };
+                self.texel.read(self.channels, &texels, self.in_tile(p))
             }
             Filter::Bilinear => {
                 let ([v00, v10, v01, v11], [s, t]) = self.around(tiles, uv);
@@ -105,7 +106,7 @@ impl Bitmap {
     /// Asks for the texels around a point; where they lie in several tiles, for those of the first.
     pub(super) fn foresee(&self, tiles: &dyn Textures, uv: [f32; 2]) {
         let at = self.place(uv, if self.filter == Filter::Nearest { 0.0 } else { 0.5 });
-        let [x, y] = std::array::from_fn(|a| self.wrapped(at[a].floor() as i32, a));
+        let [x, y] = std::array::from_fn(|a| self.wrapped(down(at[a]), a));
         let Some(texels) = tiles.at_hand(self.tile_at([x, y])) else { return };
         let n = self.in_tile([x, y]);
         let row = self.tile_size([x / TILE, y / TILE])[0] as usize * self.texel_bytes();
@@ -162,12 +163,9 @@ impl Bitmap {
     #[inline(always)]
     fn around(&self, tiles: &dyn Textures, uv: [f32; 2]) -> ([Vec3; 4], [f32; 2]) {
         let at = self.place(uv, 0.5);
-        let corner = at.map(f32::floor);
-        let [x, y] = std::array::from_fn(|a| {
-            let i = corner[a] as i32;
-            [self.wrapped(i, a), self.wrapped(i + 1, a)]
-        });
-        (self.four(tiles, x, y), [at[0] - corner[0], at[1] - corner[1]])
+        let corner = at.map(down);
+        let [x, y] = std::array::from_fn(|a| [self.wrapped(corner[a], a), self.wrapped(corner[a] + 1, a)]);
+        (self.four(tiles, x, y), std::array::from_fn(|a| at[a] - corner[a] as f32))
     }
 
     /// The texel that stands for number `i` along an axis.
@@ -192,11 +190,27 @@ impl Bitmap {
     #[inline(always)]
     fn four(&self, tiles: &dyn Textures, x: [u32; 2], y: [u32; 2]) -> [Vec3; 4] {
         let at = [[x[0], y[0]], [x[1], y[0]], [x[0], y[1]], [x[1], y[1]]];
-        let read = |texels: &[u8], p: [u32; 2]| self.texel.read(self.channels, texels, self.in_tile(p));
-        let tile = |p: [u32; 2]| tiles.tile(self.tile_at(p));
         if x[0] / TILE == x[1] / TILE && y[0] / TILE == y[1] / TILE {
-            return tile(at[0]).map_or([Vec3::ZERO; 4], |texels| at.map(|p| read(&texels, p)));
+            let Some(texels) = tiles.tile(self.tile_at(at[0])) else { return [Vec3::ZERO; 4] };
+            return self.texel.read_each(self.channels, &texels, at.map(|p| self.in_tile(p)));
         }
-        at.map(|p| tile(p).map_or(Vec3::ZERO, |texels| read(&texels, p)))
+        self.four_apart(tiles, at)
     }
+
+    /// Of several tiles.
+    #[inline(never)]
+    fn four_apart(&self, tiles: &dyn Textures, at: [[u32; 2]; 4]) -> [Vec3; 4] {
+        let read = |p| {
+            let texels = tiles.tile(self.tile_at(p))?;
+            Some(self.texel.read(self.channels, &texels, self.in_tile(p)))
+        };
+        at.map(|p| read(p).unwrap_or(Vec3::ZERO))
+    }
+}
+
+/// The next whole number down, for |x| < 2^24: `floor` is a call where vectors of 2008 may not be presumed.
+#[inline(always)]
+fn down(x: f32) -> i32 {
+    let i = x as i32;
+    i - i32::from((i as f32) > x)
 }

@@ -37,14 +37,40 @@ impl Texel {
     /// The texel of so many channels (1 or 3) that begins at a byte, linear; a grey one's value in all channels.
     #[inline(always)]
     pub fn read(self, channels: u8, bytes: &[u8], at: usize) -> Vec3 {
-        let number = |k: usize| match self {
-            Texel::Srgb8 => SRGB[usize::from(bytes[at + k])],
-            Texel::Linear8 => f32::from(bytes[at + k]) / 255.0,
-            Texel::Float => {
-                let at = at + 4 * k;
-                real(Stored::from_le_bytes([bytes[at], bytes[at + 1], bytes[at + 2], bytes[at + 3]]))
+        let [texel] = self.read_each(channels, bytes, [at]);
+        texel
+    }
+
+    /// [`Texel::read`] of several places: format and table are looked at once.
+    #[inline(always)]
+    pub fn read_each<const N: usize>(self, channels: u8, bytes: &[u8], at: [usize; N]) -> [Vec3; N] {
+        let grey = channels == 1;
+        match self {
+            Texel::Srgb8 => {
+                let table: &[f32; 256] = &SRGB;
+                each(grey, bytes, at, |&[byte]: &[u8; 1]| table[usize::from(byte)])
             }
-        };
-        if channels == 1 { Vec3::splat(number(0)) } else { Vec3::new(number(0), number(1), number(2)) }
+            Texel::Linear8 => each(grey, bytes, at, |&[byte]: &[u8; 1]| f32::from(byte) / 255.0),
+            Texel::Float => each(grey, bytes, at, |number: &[u8; 4]| real(Stored::from_le_bytes(*number))),
+        }
+    }
+}
+
+/// Texels of channels of `B` bytes each.
+#[inline(always)]
+fn each<const N: usize, const B: usize>(
+    grey: bool,
+    bytes: &[u8],
+    at: [usize; N],
+    number: impl Fn(&[u8; B]) -> f32,
+) -> [Vec3; N] {
+    if grey {
+        at.map(|at| Vec3::splat(number(&bytes[at..][..B].as_chunks().0[0])))
+    } else {
+        at.map(|at| {
+            // one check for all three
+            let channels = bytes[at..][..3 * B].as_chunks::<B>().0;
+            Vec3::new(number(&channels[0]), number(&channels[1]), number(&channels[2]))
+        })
     }
 }

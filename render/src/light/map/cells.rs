@@ -54,11 +54,11 @@ struct Uneven {
 
 /// Where a sample lies.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Spot {
+pub(in crate::light) struct Spot {
     /// In patches from the left.
-    pub(super) x: f64,
+    pub(in crate::light) x: f64,
     /// Cosine of the angle from the top.
-    pub(super) cos: f64,
+    pub(in crate::light) cos: f64,
 }
 
 impl Cells {

@@ -15,6 +15,8 @@ mod choice;
 mod tests;
 mod texels;
 
+pub(super) use self::cells::Spot;
+
 use self::cells::Cells;
 use self::choice::Choice;
 use self::texels::Texels;
@@ -63,10 +65,10 @@ pub enum SkyMapError {
 /// A patch, and where in it.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct Place {
-    x: u32,
-    y: u32,
-    fx: f32,
-    fy: f32,
+    pub(super) x: u32,
+    pub(super) y: u32,
+    pub(super) fx: f32,
+    pub(super) fy: f32,
 }
 
 impl SkyMap {
@@ -148,7 +150,7 @@ impl SkyMap {
 
     /// A unit direction of the map, by two numbers of 32 random bits.
     pub fn sample(&self, u: [u32; 2]) -> Vec3 {
-        self.direction(&self.choose(u), u)
+        self.direction(self.spot(&self.choose(u), u))
     }
 
     /// A cell, its row first.
@@ -169,18 +171,24 @@ impl SkyMap {
         self.cells.foresee_density(at.x as usize, at.y as usize);
     }
 
-    /// A direction in a cell, by the numbers that chose it.
+    /// A spot in a cell, by the numbers that chose it.
     #[inline]
-    pub(super) fn direction(&self, [row, column]: &[Choice; 2], u: [u32; 2]) -> Vec3 {
-        let spot = self.cells.spot(row, column, u);
+    pub(super) fn spot(&self, [row, column]: &[Choice; 2], u: [u32; 2]) -> Spot {
+        self.cells.spot(row, column, u)
+    }
+
+    /// Its unit direction. Without branches, as [`SkyMap::place`].
+    #[inline(always)]
+    pub(super) fn direction(&self, spot: Spot) -> Vec3 {
         let sin = ((1.0 - spot.cos) * (1.0 + spot.cos)).max(0.0).sqrt() as f32;
         let turn = (spot.x + 0.5) / f64::from(self.width);
-        let (s, c) = sincos_turn((turn - turn.floor()) as f32);
+        // between 0 and 1 and half a texel
+        let (s, c) = sincos_turn((if turn < 1.0 { turn } else { turn - 1.0 }) as f32);
         Vec3::new(sin * s, spot.cos as f32, -sin * c)
     }
 
     /// The patch that a direction lies in: a function of the direction alone, so that a direction has one density whoever asks.
-    #[inline]
+    #[inline(always)]
     pub(super) fn place(&self, d: Vec3) -> Place {
         let u = atan2(d.x, -d.z) * (0.5 / PI);
         let v = atan2((d.x * d.x + d.z * d.z).sqrt(), d.y) * (1.0 / PI);

@@ -1,0 +1,103 @@
+//! The shape of each primitive of a split, in little memory and few steps.
+
+use rayherd_render::memory::prefetch;
+
+/// Runs of a shape that are searched rather than looked up one by one: their starts stay in the first cache, where a number per
+/// primitive misses the last one at each hit.
+const RUNS: usize = 256;
+
+/// Shapes by primitive. They take no more memory than a number each: runs of shapes, or these numbers when they are fewer bytes.
+pub(crate) enum Shapes {
+    /// One by one.
+    Each(Vec<u32>),
+    /// By runs.
+    Runs(Runs),
+}
+
+pub(crate) struct Runs {
+    /// First primitive of each run but the first.
+    starts: Vec<u32>,
+    /// Shape of each run.
+    shapes: Vec<u32>,
+    /// For each of equal parts of the primitives how many runs end before it, so that a search takes a step or two.
+    guide: Vec<u32>,
+    /// Primitives of a part, as a shift.
+    shift: u32,
+}
+
+impl Shapes {
+    pub(crate) fn new(each: Vec<u32>) -> Shapes {
+        let count = each.chunk_by(|a, b| a == b).count();
+        // two numbers a run and a quarter of one for each primitive
+        if count > RUNS && 8 * count > 3 * each.len() {
+            return Shapes::Each(each);
+        }
+        let (mut starts, mut shapes) = (Vec::with_capacity(count.saturating_sub(1)), Vec::with_capacity(count));
+        let mut at = 0;
+        for run in each.chunk_by(|a, b| a == b) {
+            shapes.push(run[0]);
+            at += run.len();
+            if at < each.len() {
+                starts.push(at as u32);
+            }
+        }
+        // about two parts to a run; parts of four primitives at least, so that all of it is less than a number each
+        let shift = (each.len() / (2 * count).max(1)).max(4).next_power_of_two().trailing_zeros();
+        let part = |k: usize| starts.partition_point(|&start| start as usize <= k << shift) as u32;
+        let guide = (0..each.len().div_ceil(1 << shift)).map(part).collect();
+        Shapes::Runs(Runs { starts, shapes, guide, shift })
+    }
+
+    #[inline(always)]
+    pub(crate) fn get(&self, primitive: usize) -> u32 {
+        match self {
+            Shapes::Each(shapes) => shapes[primitive],
+            Shapes::Runs(Runs { starts, shapes, guide, shift }) => {
+                let mut run = guide[primitive >> shift] as usize;
+                while starts.get(run).is_some_and(|&start| start as usize <= primitive) {
+                    run += 1;
+                }
+                shapes[run]
+            }
+        }
+    }
+
+    /// Asks for what [`Shapes::get`] reads, where that may be far.
+    #[inline(always)]
+    pub(crate) fn foresee(&self, primitive: usize) {
+        if let Shapes::Each(shapes) = self
+            && let Some(shape) = shapes.get(primitive)
+        {
+            prefetch(shape);
+        }
+    }
+
+    pub(crate) fn bytes(&self) -> usize {
+        4 * match self {
+            Shapes::Each(shapes) => shapes.capacity(),
+            Shapes::Runs(runs) => runs.starts.capacity() + runs.shapes.capacity() + runs.guide.capacity(),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn each_primitive_has_its_shape_and_no_more_memory_is_taken() {
+        let runs = |runs: usize, length: usize| (0..runs * length).map(|i| (i / length % 7) as u32).collect::<Vec<_>>();
+        // runs of very different length: many of one part, many parts of one
+        let uneven: Vec<u32> = (0..600).flat_map(|i| vec![i % 5; if i % 100 == 0 { 5000 } else { 4 }]).collect();
+        let kinds =
+            [vec![], vec![5], vec![1, 1, 2], runs(RUNS, 3), runs(RUNS + 1, 1), runs(1000, 2), runs(1000, 9), uneven];
+        for each in kinds {
+            let shapes = Shapes::new(each.clone());
+            for (i, shape) in each.iter().enumerate() {
+                shapes.foresee(i);
+                assert_eq!(shapes.get(i), *shape, "{i} of {}", each.len());
+            }
+            assert!(shapes.bytes() <= 4 * each.len().max(4 * RUNS), "{} bytes for {}", shapes.bytes(), each.len());
+        }
+    }
+}

@@ -1,0 +1,14 @@
+//! What is computed of a sky's directions, compiled for the vectors of this machine.
+#![allow(unsafe_code)] // see `compiled`
+
+use super::picture::{Directions, Picture};
+use crate::wide::compiled;
+
+compiled!(
+    /// Turns spots of the picture into directions as they travel.
+    turn, turn, Directions, Picture
+);
+compiled!(
+    /// Finds where directions lie in the picture.
+    place, place, Directions, Picture
+);
