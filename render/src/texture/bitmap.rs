@@ -55,7 +55,7 @@ impl Bitmap {
     /// Tiles in a row, and rows of tiles.
     #[inline(always)]
     pub fn tiles_each_way(&self) -> [u32; 2] {
-        self.size.map(|n| n.div_ceil(TILE))
+        [self.size[0].div_ceil(TILE), self.size[1].div_ceil(TILE)]
     }
 
     /// Numbers of its tiles.
@@ -67,7 +67,7 @@ impl Bitmap {
     /// Width and height of the tile at a place in the grid of tiles.
     #[inline(always)]
     pub fn tile_size(&self, at: [u32; 2]) -> [u32; 2] {
-        std::array::from_fn(|a| TILE.min(self.size[a] - at[a] * TILE))
+        [TILE.min(self.size[0] - at[0] * TILE), TILE.min(self.size[1] - at[1] * TILE)]
     }
 
     /// Bytes of a texel.
@@ -90,7 +90,7 @@ impl Bitmap {
         match self.filter {
             Filter::Nearest => {
                 let at = self.place(uv, 0.0);
-                let p = std::array::from_fn(|a| self.wrapped(down(at[a]), a));
+                let p = [self.wrapped(down(at[0]), 0), self.wrapped(down(at[1]), 1)];
                 let Some(texels) = tiles.tile(self.tile_at(p)) else { return Vec3::ZERO };
                 self.texel.read(self.channels, &texels, self.in_tile(p))
             }
@@ -106,7 +106,7 @@ impl Bitmap {
     /// Asks for the texels around a point; where they lie in several tiles, for those of the first.
     pub(super) fn foresee(&self, tiles: &dyn Textures, uv: [f32; 2]) {
         let at = self.place(uv, if self.filter == Filter::Nearest { 0.0 } else { 0.5 });
-        let [x, y] = std::array::from_fn(|a| self.wrapped(down(at[a]), a));
+        let [x, y] = [self.wrapped(down(at[0]), 0), self.wrapped(down(at[1]), 1)];
         let Some(texels) = tiles.at_hand(self.tile_at([x, y])) else { return };
         let n = self.in_tile([x, y]);
         let row = self.tile_size([x / TILE, y / TILE])[0] as usize * self.texel_bytes();
@@ -153,19 +153,22 @@ impl Bitmap {
     #[inline(always)]
     fn place(&self, uv: [f32; 2], shift: f32) -> [f32; 2] {
         let at = self.to_uv.point(uv);
-        std::array::from_fn(|a| {
+        let along = |a: usize| {
             let x = at[a] * self.size[a] as f32 - shift;
             if x.abs() < 16_777_216.0 { x } else { 0.0 }
-        })
+        };
+        [along(0), along(1)]
     }
 
     /// The four texels around a point, and the weights of the right and the lower ones.
     #[inline(always)]
     fn around(&self, tiles: &dyn Textures, uv: [f32; 2]) -> ([Vec3; 4], [f32; 2]) {
         let at = self.place(uv, 0.5);
-        let corner = at.map(down);
-        let [x, y] = std::array::from_fn(|a| [self.wrapped(corner[a], a), self.wrapped(corner[a] + 1, a)]);
-        (self.four(tiles, x, y), std::array::from_fn(|a| at[a] - corner[a] as f32))
+        // written out: `map` on arrays is a call
+        let corner = [down(at[0]), down(at[1])];
+        let x = [self.wrapped(corner[0], 0), self.wrapped(corner[0] + 1, 0)];
+        let y = [self.wrapped(corner[1], 1), self.wrapped(corner[1] + 1, 1)];
+        (self.four(tiles, x, y), [at[0] - corner[0] as f32, at[1] - corner[1] as f32])
     }
 
     /// The texel that stands for number `i` along an axis.
@@ -192,7 +195,9 @@ impl Bitmap {
         let at = [[x[0], y[0]], [x[1], y[0]], [x[0], y[1]], [x[1], y[1]]];
         if x[0] / TILE == x[1] / TILE && y[0] / TILE == y[1] / TILE {
             let Some(texels) = tiles.tile(self.tile_at(at[0])) else { return [Vec3::ZERO; 4] };
-            return self.texel.read_each(self.channels, &texels, at.map(|p| self.in_tile(p)));
+            let [a, b, c, d] = at;
+            let places = [self.in_tile(a), self.in_tile(b), self.in_tile(c), self.in_tile(d)];
+            return self.texel.read_each(self.channels, &texels, places);
         }
         self.four_apart(tiles, at)
     }

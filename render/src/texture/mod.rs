@@ -34,7 +34,8 @@ impl UvMap {
     /// Image of a point.
     #[inline(always)]
     pub fn point(&self, [u, v]: [f32; 2]) -> [f32; 2] {
-        self.0.map(|row| row[0] * u + row[1] * v + row[2])
+        let along = |row: [f32; 3]| row[0] * u + row[1] * v + row[2];
+        [along(self.0[0]), along(self.0[1])]
     }
 }
 

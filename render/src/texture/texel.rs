@@ -56,7 +56,7 @@ impl Texel {
     }
 }
 
-/// Texels of channels of `B` bytes each.
+/// Texels of channels of `B` bytes each. With loops: `map` on arrays is a call.
 #[inline(always)]
 fn each<const N: usize, const B: usize>(
     grey: bool,
@@ -64,13 +64,17 @@ fn each<const N: usize, const B: usize>(
     at: [usize; N],
     number: impl Fn(&[u8; B]) -> f32,
 ) -> [Vec3; N] {
+    let mut texels = [Vec3::ZERO; N];
     if grey {
-        at.map(|at| Vec3::splat(number(&bytes[at..][..B].as_chunks().0[0])))
+        for (texel, at) in texels.iter_mut().zip(at) {
+            *texel = Vec3::splat(number(&bytes[at..][..B].as_chunks().0[0]));
+        }
     } else {
-        at.map(|at| {
+        for (texel, at) in texels.iter_mut().zip(at) {
             // one check for all three
             let channels = bytes[at..][..3 * B].as_chunks::<B>().0;
-            Vec3::new(number(&channels[0]), number(&channels[1]), number(&channels[2]))
-        })
+            *texel = Vec3::new(number(&channels[0]), number(&channels[1]), number(&channels[2]));
+        }
     }
+    texels
 }
