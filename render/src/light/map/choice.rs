@@ -74,8 +74,8 @@ pub(super) struct Guide {
 }
 
 impl Guide {
-    /// Intervals to a part, about: a line of ends.
-    const COARSE: usize = 16;
+    /// Intervals to a part, about.
+    const COARSE: usize = 4;
 
     /// Over rows of so many ends each.
     pub(super) fn new(ends: &[u32], width: usize) -> Guide {
