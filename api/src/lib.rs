@@ -8,6 +8,8 @@ pub mod aov;
 pub mod byte_size;
 pub mod image_size;
 pub mod job;
+#[cfg(all(test, feature = "kube"))]
+mod reference;
 #[cfg(feature = "kube")]
 pub mod resource;
 pub mod strategy;

@@ -16,7 +16,9 @@ mod progress;
 mod run_options;
 mod skip_options;
 mod source;
+mod storage;
 mod store;
+mod upload;
 
 use std::process::ExitCode;
 

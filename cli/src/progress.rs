@@ -149,7 +149,8 @@ fn seconds_left(status: &Status, target_error: Option<f64>) -> Option<f64> {
     Some(per_sample * left.min(to_target))
 }
 
-fn duration(seconds: f64) -> String {
+/// In its largest units.
+pub fn duration(seconds: f64) -> String {
     match seconds.ceil() as u64 {
         s if s < 60 => format!("{s} s"),
         s if s < 3600 => format!("{} min {:02} s", s / 60, s % 60),

@@ -5,6 +5,7 @@
 
 use std::path::Path;
 use std::sync::Arc;
+use std::sync::atomic::AtomicU64;
 
 use anyhow::Context;
 use clap::Args;
@@ -29,7 +30,7 @@ pub struct S3Options {
     /// Address of an S3 server that is not AWS, such as http://localhost:9000 [default: AWS_ENDPOINT_URL, or AWS];
     /// keys come from AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY
     #[arg(long, value_name = "URL")]
-    s3_endpoint: Option<String>,
+    pub s3_endpoint: Option<String>,
     /// Keep what is read of a prepared scene in S3 in a temporary folder too, up to so many bytes: what memory drops is fetched once
     #[arg(long, value_name = "SIZE")]
     s3_cache: Option<ByteSize>,
@@ -41,6 +42,8 @@ pub struct Store {
     pub blocks: Arc<dyn BlockStore>,
     /// Prepared scenes in it.
     pub objects: Arc<dyn ObjectStore>,
+    /// Bytes of files that were put so far; of a folder none are counted.
+    pub sent: Arc<AtomicU64>,
     runtime: Runtime,
 }
 
@@ -60,6 +63,7 @@ impl Store {
                 };
                 anyhow::Error::new(error).context(format!("cannot open {address} at {server} ({remedy})"))
             })?;
+            let sent = bucket.sent();
             let blocks: Arc<dyn BlockStore> = Arc::new(Retrying::new(Arc::new(bucket), RetryPolicy::default()));
             let read: Arc<dyn BlockStore> = match s3.s3_cache {
                 None => blocks.clone(),
@@ -71,7 +75,7 @@ impl Store {
                 }
             };
             let objects = Arc::new(SceneObjects::new(read, runtime.handle().clone())?);
-            return Ok(Store { blocks, objects, runtime });
+            return Ok(Store { blocks, objects, sent, runtime });
         }
         for (flag, given) in [("--s3-endpoint", s3.s3_endpoint.is_some()), ("--s3-cache", s3.s3_cache.is_some())] {
             if given {
@@ -84,7 +88,7 @@ impl Store {
         let cannot = || format!("cannot open the store {address}: name a folder that can be written to");
         let blocks = Arc::new(DirectoryStore::open(address).with_context(cannot)?);
         let objects = Arc::new(DirectoryObjects::open(address).with_context(cannot)?);
-        Ok(Store { blocks, objects, runtime })
+        Ok(Store { blocks, objects, sent: Arc::default(), runtime })
     }
 
     /// Opens a store that must be there already.

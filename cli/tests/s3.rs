@@ -3,12 +3,16 @@
 mod common;
 
 use std::fs;
+use std::io::{Read, Write};
+use std::net::TcpListener;
 use std::path::Path;
 use std::process::{Child, Command, Stdio};
+use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 use common::{Run, assert_mistake, repository};
 use rayherd_herd::store::s3_server::{BUCKET, S3Faults, S3Server};
+use rayherd_tests::mutation::peak_memory_of;
 use serde_json::Value;
 use tokio::runtime::Runtime;
 
@@ -31,8 +35,8 @@ impl Server {
         let mut command = Command::new(env!("CARGO_BIN_EXE_rayherd"));
         command.args(arguments).args(["--s3-endpoint", settings.endpoint.as_deref().unwrap()]);
         command.current_dir(folder).env_remove("RUST_LOG").env_remove("RUST_BACKTRACE");
-        command.env("AWS_ACCESS_KEY_ID", settings.credentials.access_key);
-        command.env("AWS_SECRET_ACCESS_KEY", settings.credentials.secret_key);
+        command.env("AWS_ACCESS_KEY_ID", S3Server::key().access_key);
+        command.env("AWS_SECRET_ACCESS_KEY", S3Server::key().secret_key);
         command
     }
 
@@ -102,6 +106,115 @@ fn serves_as_a_folder_does(store: &str, run: &dyn Fn(&Path, &[&str]) -> Run, wor
     assert!(fs::read(folder.join("b.exr")).unwrap() == fs::read(folder.join("long.exr")).unwrap());
 }
 
+/// A cluster that does not answer, as kubectl knows it.
+fn no_cluster(folder: &Path) -> String {
+    let path = folder.join("kubeconfig");
+    let text = "{apiVersion: v1, kind: Config, current-context: c, clusters: [{name: c, cluster: {server: 'http://127.0.0.1:1'}}], \
+                users: [{name: u, user: {}}], contexts: [{name: c, context: {cluster: c, user: u}}]}";
+    fs::write(&path, text).unwrap();
+    path.to_str().unwrap().to_owned()
+}
+
+/// Uploads a scene as `submit` does, and renders a job of it from there by its profile: the same bytes as from the local file.
+fn a_scene_goes_there_and_comes_back(store: &str, profile: &str, run: &dyn Fn(&Path, &[&str], &[(&str, &str)]) -> Run) {
+    let folder = tempfile::tempdir().unwrap();
+    let folder = folder.path();
+    let kubeconfig = no_cluster(folder);
+    let scene = folder.join("box");
+    fs::create_dir(&scene).unwrap();
+    fs::copy(repository("examples/cornell-box.xml"), scene.join("box.xml")).unwrap();
+    // beside it, and above what goes in one put
+    fs::write(scene.join("large.bin"), vec![7; 70 << 20]).unwrap();
+    let submit = ["submit", "box/box.xml", "--store", store];
+    let told = |run: &Run| run.err.lines().find_map(|l| l.strip_prefix("the scene is ")).map(str::to_owned);
+    let sent = run(folder, &submit, &[("KUBECONFIG", &kubeconfig)]);
+    // the cluster is asked last
+    assert!(sent.code == 1 && sent.err.contains("2 of 2 files uploaded"), "{}", sent.err);
+    let key = told(&sent).unwrap();
+    let again = run(folder, &submit, &[("KUBECONFIG", &kubeconfig)]);
+    assert!(again.err.contains("0 of 2 files uploaded") && told(&again).as_ref() == Some(&key), "{}", again.err);
+
+    fs::write(folder.join("profile.yaml"), profile).unwrap();
+    let job = format!(
+        "{{apiVersion: rayherd.io/v1alpha1, kind: RenderJob, metadata: {{name: b}}, spec: {{scene: {{source: {key}}}, \
+         image: {{size: 16x16}}, sampling: {{spp: 4}}, splits: 3, replicas: 1}}}}"
+    );
+    fs::write(folder.join("job.yaml"), job).unwrap();
+    let there = run(folder, &["render", "-f", "job.yaml", "--profile", "profile.yaml", "-o", "there.exr"], &[]);
+    assert_eq!(there.code, 0, "{}", there.err);
+    let here = common::rayherd(folder, &["render", "-f", "job.yaml", "--scene", "box/box.xml", "-o", "here.exr"]);
+    assert_eq!(here.code, 0, "{}", here.err);
+    assert!(fs::read(folder.join("there.exr")).unwrap() == fs::read(folder.join("here.exr")).unwrap());
+    // its own source is no file here
+    assert_mistake(&common::rayherd(folder, &["render", "-f", "job.yaml", "-o", "x.exr"]), &["box.xml"]);
+}
+
+#[test]
+fn a_scene_is_submitted_and_rendered_by_its_profile() {
+    let server = Server::start();
+    let run = |folder: &Path, arguments: &[&str], variables: &[(&str, &str)]| {
+        finish(server.command(folder, arguments).envs(variables.iter().copied()).output().unwrap())
+    };
+    // inside the cluster: the flag says where
+    let service = "{bucket: test-bucket, prefix: herd, service: {namespace: s, name: minio, servers: 3}}";
+    a_scene_goes_there_and_comes_back(&format!("s3://{BUCKET}/herd"), service, &run);
+    let folder = tempfile::tempdir().unwrap();
+    let folder = folder.path();
+    fs::write(folder.join("p.yaml"), service).unwrap();
+    let job =
+        "{apiVersion: rayherd.io/v1alpha1, kind: RenderJob, metadata: {name: b}, spec: {scene: {source: no/such.xml}}}";
+    fs::write(folder.join("job.yaml"), job).unwrap();
+    let of_profile = ["render", "-f", "job.yaml", "--profile", "p.yaml", "-o", "x.exr"];
+    assert_mistake(&run(folder, &of_profile, &[]), &["no/such.xml", "upload the scene first"]);
+    assert_mistake(&common::rayherd(folder, &of_profile), &["p.yaml", "--s3-endpoint"]);
+    assert_eq!(common::rayherd(folder, &["render", "x.ply", "--profile", "p.yaml"]).code, 2);
+}
+
+/// Parts that were sent before the server went away are not sent again, and no file is held in memory.
+#[test]
+fn an_upload_goes_on_within_a_file() {
+    let server = Server::start();
+    let folder = tempfile::tempdir().unwrap();
+    let folder = folder.path();
+    let kubeconfig = no_cluster(folder);
+    fs::create_dir(folder.join("scene")).unwrap();
+    // twenty parts of 8 MiB, no two alike
+    let bytes: u64 = 160 << 20;
+    let body: Vec<u8> = (0..bytes / 8).flat_map(u64::to_le_bytes).collect();
+    fs::write(folder.join("scene/large.bin"), &body).unwrap();
+    drop(body);
+    let store = format!("s3://{BUCKET}/on");
+    let command = || {
+        let mut command = server.command(folder, &["submit", "scene", "--store", &store]);
+        command.env("KUBECONFIG", &kubeconfig).stdout(Stdio::null()).stderr(Stdio::piped());
+        command
+    };
+    server.server.set_faults(S3Faults { latency: Duration::from_millis(5), ..S3Faults::default() });
+    let mut child = command().spawn().unwrap();
+    let (begun, mut peak) = (Instant::now(), None);
+    while server.server.uploads().0 < 8 && begun.elapsed() < Duration::from_secs(120) {
+        peak = peak_memory_of(child.id()).max(peak);
+        assert!(child.try_wait().unwrap().is_none(), "too soon at its end");
+        std::thread::sleep(Duration::from_millis(1));
+    }
+    server.server.set_faults(S3Faults { unavailable: 1000, ..S3Faults::default() });
+    let stopped = finish(child.wait_with_output().unwrap());
+    assert_eq!(stopped.code, 1, "{}", stopped.err);
+    assert!(stopped.err.contains("the same command goes on"), "{}", stopped.err);
+    if let Some(kib) = peak {
+        assert!(kib << 10 < bytes / 2 + (40 << 20), "{kib} KiB for a file of {bytes} bytes");
+    }
+    let (before, unfinished) = server.server.uploads();
+    assert_eq!(unfinished.len(), 1, "{unfinished:?}");
+    server.server.set_faults(S3Faults::default());
+    let more = finish(command().output().unwrap());
+    assert!(more.err.contains("1 of 1 files uploaded, 160"), "{}", more.err);
+    let (after, unfinished) = server.server.uploads();
+    // four may have been on their way
+    assert!(unfinished.is_empty() && after - before <= 20 - before + 4, "{before} parts, then {} more", after - before);
+    println!("{before} parts, then {} more; at most {peak:?} KiB", after - before);
+}
+
 #[test]
 fn a_bucket_serves_as_a_folder_does() {
     let server = Server::start();
@@ -160,6 +273,14 @@ fn a_real_bucket_serves_as_a_folder_does() {
         common::rayherd(folder, &[arguments, &["--s3-endpoint", &endpoint]].concat())
     };
     serves_as_a_folder_does(&store, &run, &|_| {});
+    let with = |folder: &Path, arguments: &[&str], variables: &[(&str, &str)]| {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_rayherd"));
+        command.args(arguments).args(["--s3-endpoint", &endpoint]).envs(variables.iter().copied());
+        finish(command.current_dir(folder).output().unwrap())
+    };
+    let profile =
+        format!("{{bucket: {}, prefix: sent, endpoints: [{{url: '{endpoint}'}}]}}", variable("RAYHERD_S3_BUCKET"));
+    a_scene_goes_there_and_comes_back(&format!("s3://{}/sent", variable("RAYHERD_S3_BUCKET")), &profile, &with);
     let folder = tempfile::tempdir().unwrap();
     let denied = Command::new(env!("CARGO_BIN_EXE_rayherd"))
         .args(["inspect", &store, "--s3-endpoint", &endpoint])
@@ -204,6 +325,91 @@ fn a_server_that_goes_away_costs_only_time() {
     assert!(fs::read(folder.join("x.exr")).unwrap() == fs::read(folder.join("whole.exr")).unwrap());
 }
 
+/// A server of HTTP that answers every request alike; its address, and what it was asked.
+fn answering(status: &'static str, body: String) -> (String, Arc<Mutex<Vec<String>>>) {
+    let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+    let address = format!("http://{}", listener.local_addr().unwrap());
+    let asked = Arc::new(Mutex::new(Vec::new()));
+    let of_thread = asked.clone();
+    std::thread::spawn(move || {
+        for socket in listener.incoming() {
+            let (mut socket, mut request, mut part) = (socket.unwrap(), String::new(), [0; 4096]);
+            let whole = |request: &str| {
+                let (head, body) = request.split_once("\r\n\r\n")?;
+                let length = head.to_lowercase().split("content-length: ").nth(1)?.lines().next()?.parse().ok();
+                Some(body.len() >= length.unwrap_or(0))
+            };
+            while !whole(&request).unwrap_or(request.starts_with("GET") && request.ends_with("\r\n\r\n")) {
+                match socket.read(&mut part).unwrap() {
+                    0 => break,
+                    n => request.push_str(&String::from_utf8_lossy(&part[..n])),
+                }
+            }
+            of_thread.lock().unwrap().push(request);
+            let head = format!("HTTP/1.1 {status}\r\ncontent-length: {}\r\nconnection: close\r\n\r\n", body.len());
+            socket.write_all(format!("{head}{body}").as_bytes()).unwrap();
+        }
+    });
+    (address, asked)
+}
+
+/// A role's keys from STS for a token, or from a container's address: no key in the environment.
+#[test]
+fn a_clouds_identity_is_used_where_there_is_no_key() {
+    let server = Server::start();
+    let folder = tempfile::tempdir().unwrap();
+    let folder = folder.path();
+    let (scene, token) = (scene(), folder.join("token"));
+    fs::write(&token, "who-i-am").unwrap();
+    let key = S3Server::key();
+    let (id, secret) = (&key.access_key, &key.secret_key);
+    let sts = format!(
+        "<AssumeRoleWithWebIdentityResponse xmlns=\"https://sts.amazonaws.com/doc/2011-06-15/\"><AssumeRoleWithWebIdentityResult>\
+         <Credentials><AccessKeyId>{id}</AccessKeyId><SecretAccessKey>{secret}</SecretAccessKey><SessionToken>passing</SessionToken>\
+         <Expiration>2100-01-01T00:00:00Z</Expiration></Credentials>\
+         <AssumedRoleUser><AssumedRoleId>a:b</AssumedRoleId><Arn>arn:x</Arn></AssumedRoleUser>\
+         </AssumeRoleWithWebIdentityResult></AssumeRoleWithWebIdentityResponse>"
+    );
+    let (sts, asked_sts) = answering("200 OK", sts);
+    let container = format!(
+        r#"{{"AccessKeyId":"{id}","SecretAccessKey":"{secret}","Token":"passing","Expiration":"2100-01-01T00:00:00Z"}}"#
+    );
+    let (container, asked_container) = answering("200 OK", container);
+    let denied =
+        "<ErrorResponse><Error><Code>AccessDenied</Code><Message>not this role</Message></Error></ErrorResponse>";
+    let (denying, _) = answering("403 Forbidden", denied.into());
+    let token = token.to_str().unwrap();
+    let run = |store: &str, variables: &[(&str, &str)]| {
+        let store = format!("s3://{BUCKET}/{store}");
+        let mut command = server.command(folder, &["prepare", &scene, "--store", &store]);
+        command.env_remove("AWS_ACCESS_KEY_ID").env_remove("AWS_SECRET_ACCESS_KEY");
+        finish(command.envs(variables.iter().copied()).output().unwrap())
+    };
+    let web = |sts| {
+        [
+            ("AWS_WEB_IDENTITY_TOKEN_FILE", token),
+            ("AWS_ROLE_ARN", "arn:aws:iam::1:role/herd"),
+            ("AWS_ENDPOINT_URL_STS", sts),
+        ]
+    };
+    let done = run("web", &web(&sts));
+    assert_eq!(done.code, 0, "{}", done.err);
+    let asked = asked_sts.lock().unwrap().join("\n");
+    for part in ["Action=AssumeRoleWithWebIdentity", "WebIdentityToken=who-i-am", "role%2Fherd"] {
+        assert!(asked.contains(part), "no {part} in {asked}");
+    }
+    let uri = format!("{container}/keys");
+    let done = run(
+        "container",
+        &[("AWS_CONTAINER_CREDENTIALS_FULL_URI", &uri), ("AWS_CONTAINER_AUTHORIZATION_TOKEN_FILE", token)],
+    );
+    assert_eq!(done.code, 0, "{}", done.err);
+    let asked = asked_container.lock().unwrap().join("\n");
+    assert!(asked.starts_with("GET /keys") && asked.to_lowercase().contains("authorization: who-i-am"), "{asked}");
+    let refused = run("denied", &web(&denying));
+    assert!(refused.code == 1 && refused.err.contains("not this role"), "{}: {}", refused.code, refused.err);
+}
+
 #[test]
 fn what_the_user_can_put_right_is_told() {
     let server = Server::start();
@@ -219,7 +425,7 @@ fn what_the_user_can_put_right_is_told() {
     assert_mistake(&server.run(folder, &["prepare", &scene, "--store", "s3://no-such-bucket/p"]), &["no-such-bucket"]);
     assert_mistake(&server.run(folder, &["inspect", &store]), &["holds no prepared scene"]);
     // nobody listens: the port of a listener that is gone
-    let port = std::net::TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
+    let port = TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
     let gone = Command::new(env!("CARGO_BIN_EXE_rayherd"))
         .args(arguments)
         .args(["--s3-endpoint", &format!("http://127.0.0.1:{port}")])

@@ -88,6 +88,7 @@ pub fn pod(
     let mut pod = json!({
         "spec": {
             "enableServiceLinks": false,
+            "serviceAccountName": storage.service_account,
             "terminationGracePeriodSeconds": GRACE_SECONDS,
             "affinity": affinity(&uid, held, job.spec.placement),
             "securityContext": {
@@ -111,12 +112,19 @@ pub fn pod(
             "volumes": [{"name": "scratch", "emptyDir": {}}],
         },
     });
+    if storage.service_account.is_none() {
+        drop(pod["spec"].as_object_mut().and_then(|spec| spec.remove("serviceAccountName")));
+    }
     // of a template metadata and spec count; kind and version may be written
     for part in ["metadata", "spec"] {
         if let Some(wanted) = job.spec.workers.template.as_ref().and_then(|t| t.get(part)) {
             merge(&mut pod[part], wanted);
         }
     }
+    let keys = match storage.identity {
+        true => json!([]),
+        false => json!([{"secretRef": {"name": secret_name(&job.spec.storage)}}]),
+    };
     let ours = json!({
         "apiVersion": "v1",
         "kind": "Pod",
@@ -136,7 +144,7 @@ pub fn pod(
             "containers": [{
                 "name": "worker",
                 "env": env,
-                "envFrom": [{"secretRef": {"name": secret_name(&job.spec.storage)}}],
+                "envFrom": keys,
                 "volumeMounts": [{"name": "token", "mountPath": "/var/run/secrets/rayherd", "readOnly": true}],
             }],
             "volumes": [{"name": "token", "projected": {"sources": [
@@ -296,6 +304,7 @@ mod tests {
             prefix: String::new(),
             region: "r".into(),
             endpoints: vec![Endpoint { url: "http://m".into(), node: Some("node1".into()) }],
+            ..Storage::default()
         };
         let held = BTreeMap::from([("node1".to_owned(), 1000), ("node2".to_owned(), 1), ("node3".to_owned(), 0)]);
         let pod: Pod =
@@ -320,7 +329,7 @@ mod tests {
 
     #[test]
     fn a_template_comes_on_top_but_a_worker_stays_one() {
-        let storage = Storage { bucket: "b".into(), prefix: String::new(), region: "r".into(), endpoints: vec![] };
+        let storage = Storage { bucket: "b".into(), region: "r".into(), ..Storage::default() };
         let held = BTreeMap::from([("node1".to_owned(), 1000)]);
         let made = |job: &RenderJobObject| pod(job, &config(), &storage, &held, "PEM", 1, "box-w1").unwrap();
         let mut with = job();
@@ -381,6 +390,19 @@ mod tests {
         let mut without = job();
         without.spec.placement = Placement::None;
         assert_eq!(made(&without).pointer("/spec/affinity/nodeAffinity"), None);
+    }
+
+    #[test]
+    fn a_worker_with_an_identity_has_an_account_and_no_keys() {
+        let made = |storage: &Storage| {
+            let pod = pod(&job(), &config(), storage, &BTreeMap::new(), "PEM", 0, "box-w0").unwrap();
+            let spec = serde_json::from_value::<Pod>(pod).unwrap().spec.unwrap();
+            (spec.service_account_name, spec.containers[0].env_from.clone().unwrap_or_default().len())
+        };
+        assert_eq!(made(&Storage::default()), (None, 1));
+        let account = Some("renderer".to_owned());
+        let known = Storage { identity: true, service_account: account.clone(), ..Storage::default() };
+        assert_eq!(made(&known), (account, 0));
     }
 
     #[test]

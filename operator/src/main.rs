@@ -1,6 +1,7 @@
 //! The operator: watches RenderJobs, runs their workers, plans and commits their rounds.
 
 mod authority;
+mod buckets;
 mod build;
 mod config;
 mod finish;
@@ -57,8 +58,13 @@ async fn main() -> ExitCode {
     }
     let filter = tracing_subscriber::EnvFilter::try_from_default_env().unwrap_or_else(|_| "info".into());
     tracing_subscriber::fmt().with_env_filter(filter).with_ansi(false).init();
-    let trial = std::env::args().nth(1).as_deref() == Some("trial");
-    match if trial { try_render().await } else { run().await } {
+    let arguments: Vec<String> = std::env::args().skip(1).collect();
+    let done = match arguments.first().map(String::as_str) {
+        Some("trial") => try_render().await,
+        Some("buckets") => buckets::make(&arguments[1..]).await,
+        _ => run().await,
+    };
+    match done {
         Ok(()) => ExitCode::SUCCESS,
         Err(e) => {
             tracing::error!("{e:#}");

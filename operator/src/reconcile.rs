@@ -357,7 +357,7 @@ async fn depot(
 ) -> Result<(Storage, rayherd_herd::remote::Depot), Error> {
     let spec = &job.spec.storage;
     let found = storage::storage(&context.client, &context.config.namespace, spec).await?;
-    let credentials = storage::credentials(&context.client, namespace, spec).await?;
+    let credentials = storage::credentials(&context.client, namespace, spec, &found).await?;
     let depot = found.depot(None, &credentials).map_err(|e| StorageError::Missing(e.to_string()))?;
     Ok((found, depot))
 }

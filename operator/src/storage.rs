@@ -8,9 +8,8 @@ use k8s_openapi::api::discovery::v1::EndpointSlice;
 use kube::api::ListParams;
 use kube::{Api, Client};
 use rayherd_api::StorageSpec;
-use rayherd_herd::remote::{Endpoint, Storage};
-use rayherd_herd::store::S3Credentials;
-use serde::Deserialize;
+use rayherd_herd::remote::{Endpoint, Profile, Service, Storage};
+use rayherd_herd::store::{S3Credentials, S3Key};
 
 /// Why the storage cannot be used (yet).
 #[derive(Debug, thiserror::Error)]
@@ -26,38 +25,6 @@ pub enum StorageError {
         /// Why not.
         source: kube::Error,
     },
-}
-
-/// A profile, as it stands in a ConfigMap under `profile.yaml`.
-#[derive(Clone, Debug, Deserialize)]
-#[serde(rename_all = "camelCase", deny_unknown_fields)]
-struct Profile {
-    bucket: String,
-    #[serde(default)]
-    prefix: String,
-    #[serde(default)]
-    region: Option<String>,
-    /// A headless service of a StatefulSet of the same name.
-    #[serde(default)]
-    service: Option<Service>,
-    /// Servers by address.
-    #[serde(default)]
-    endpoints: Vec<Endpoint>,
-}
-
-#[derive(Clone, Debug, Deserialize)]
-#[serde(rename_all = "camelCase", deny_unknown_fields)]
-struct Service {
-    namespace: String,
-    name: String,
-    #[serde(default = "default_port")]
-    port: u16,
-    /// How many; each keeps its number, there or not.
-    servers: u32,
-}
-
-fn default_port() -> u16 {
-    9000
 }
 
 /// Name of a profile's ConfigMap.
@@ -81,7 +48,10 @@ pub async fn storage(client: &Client, own: &str, spec: &StorageSpec) -> Result<S
     let profile: Profile =
         serde_yaml::from_str(&text).map_err(|e| missing(&format!("cannot be read: profile.yaml: {e}")))?;
     let mut endpoints = profile.endpoints.clone();
-    if let Some(service) = &profile.service {
+    if profile.distributed {
+        endpoints =
+            vec![profile.one_store().ok_or_else(|| missing("is distributed: give a service, or one endpoint"))?];
+    } else if let Some(service) = &profile.service {
         let what = format!("EndpointSlices of {}/{}", service.namespace, service.name);
         let slices: Api<EndpointSlice> = Api::namespaced(client.clone(), &service.namespace);
         let params = ListParams::default().labels(&format!("kubernetes.io/service-name={}", service.name));
@@ -92,7 +62,8 @@ pub async fn storage(client: &Client, own: &str, spec: &StorageSpec) -> Result<S
         return Err(missing("names no server that is there"));
     }
     let region = profile.region.unwrap_or_else(|| "us-east-1".into());
-    Ok(Storage { bucket: profile.bucket, prefix: profile.prefix, region, endpoints })
+    let Profile { bucket, prefix, identity, service_account, .. } = profile;
+    Ok(Storage { bucket, prefix, region, endpoints, identity, service_account })
 }
 
 /// The servers of a StatefulSet in the order of their numbers, with the nodes that they run on now. One that is away has its place
@@ -110,8 +81,17 @@ fn servers(slices: &[EndpointSlice], service: &Service) -> Vec<Endpoint> {
     (0..*servers).map(server).collect()
 }
 
-/// The credentials of a job.
-pub async fn credentials(client: &Client, namespace: &str, spec: &StorageSpec) -> Result<S3Credentials, StorageError> {
+/// The credentials of a job whose storage was found: the operator's own identity, or the key in the Secret of the job's namespace.
+pub async fn credentials(
+    client: &Client,
+    namespace: &str,
+    spec: &StorageSpec,
+    found: &Storage,
+) -> Result<S3Credentials, StorageError> {
+    if found.identity {
+        let told = |e: rayherd_herd::store::StoreError| StorageError::Missing(format!("the operator: {e}"));
+        return S3Credentials::identity().map_err(told);
+    }
     let name = secret_name(spec);
     let what = format!("Secret {namespace}/{name}");
     let secrets: Api<Secret> = Api::namespaced(client.clone(), namespace);
@@ -121,11 +101,12 @@ pub async fn credentials(client: &Client, namespace: &str, spec: &StorageSpec) -
     let data = secret.data.unwrap_or_default();
     let text = |key: &str| data.get(key).and_then(|ByteString(b)| String::from_utf8(b.clone()).ok());
     let need = |key: &str| text(key).ok_or_else(|| missing(&format!("has no {key}")));
-    Ok(S3Credentials {
+    let key = S3Key {
         access_key: need("AWS_ACCESS_KEY_ID")?,
         secret_key: need("AWS_SECRET_ACCESS_KEY")?,
         session_token: text("AWS_SESSION_TOKEN"),
-    })
+    };
+    Ok(key.into())
 }
 
 #[cfg(test)]

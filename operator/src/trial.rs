@@ -27,13 +27,15 @@ pub async fn try_render() -> anyhow::Result<()> {
     let profile = std::env::var("RAYHERD_TRIAL_PROFILE").ok().filter(|p| !p.is_empty());
     let client = Client::try_default().await?;
     let spec = StorageSpec { profile, ..StorageSpec::default() };
-    let secrets: Api<Secret> = Api::namespaced(client.clone(), &namespace);
-    let name = storage::secret_name(&spec);
-    if secrets.get_opt(&name).await?.is_none() {
-        bail!("namespace {namespace} has no Secret {name}: make it, or set trial.namespace to one that has it");
-    }
     let found = storage::storage(&client, &own, &spec).await?;
-    let depot = found.depot(None, &storage::credentials(&client, &namespace, &spec).await?)?;
+    if !found.identity {
+        let secrets: Api<Secret> = Api::namespaced(client.clone(), &namespace);
+        let name = storage::secret_name(&spec);
+        if secrets.get_opt(&name).await?.is_none() {
+            bail!("namespace {namespace} has no Secret {name}: make it, or set trial.namespace to one that has it");
+        }
+    }
+    let depot = found.depot(None, &storage::credentials(&client, &namespace, &spec, &found).await?)?;
     let source = format!("scenes/{NAME}/cornell-box.xml");
     depot.replicated(2)?.put(&source, SCENE.into()).await.context("cannot put a scene into the storage")?;
     let jobs: Api<RenderJobObject> = Api::namespaced(client, &namespace);

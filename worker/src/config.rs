@@ -5,7 +5,7 @@ use std::time::{SystemTime, UNIX_EPOCH};
 
 use anyhow::Context;
 use rayherd_herd::remote::{Storage, WorkerId};
-use rayherd_herd::store::S3Credentials;
+use rayherd_herd::store::{S3Credentials, S3Key};
 
 /// Settings of a worker.
 pub struct Config {
@@ -50,18 +50,24 @@ impl Config {
         let nanos = SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |d| d.as_nanos());
         // a container that starts again in its pod is another session
         let session = format!("{}-{nanos:x}", need("RAYHERD_POD")?);
+        let storage: Storage =
+            serde_json::from_str(&need("RAYHERD_STORAGE")?).context("RAYHERD_STORAGE cannot be read")?;
+        let credentials = match storage.identity {
+            true => S3Credentials::identity()?,
+            false => S3Credentials::Key(S3Key {
+                access_key: need("AWS_ACCESS_KEY_ID")?,
+                secret_key: need("AWS_SECRET_ACCESS_KEY")?,
+                session_token: variable("AWS_SESSION_TOKEN"),
+            }),
+        };
         Ok(Config {
             operator: need("RAYHERD_OPERATOR")?.trim_end_matches('/').to_owned(),
             job: need("RAYHERD_JOB")?,
             worker: WorkerId { number: number("RAYHERD_WORKER")?, session },
             slots: number("RAYHERD_SLOTS")?,
             node: variable("RAYHERD_NODE"),
-            storage: serde_json::from_str(&need("RAYHERD_STORAGE")?).context("RAYHERD_STORAGE cannot be read")?,
-            credentials: S3Credentials {
-                access_key: need("AWS_ACCESS_KEY_ID")?,
-                secret_key: need("AWS_SECRET_ACCESS_KEY")?,
-                session_token: variable("AWS_SESSION_TOKEN"),
-            },
+            storage,
+            credentials,
             scratch: need("RAYHERD_SCRATCH")?.into(),
             token: need("RAYHERD_TOKEN_FILE")?.into(),
             authority: need("RAYHERD_CA")?,

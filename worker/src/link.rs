@@ -92,7 +92,7 @@ mod tests {
     use std::path::Path;
 
     use rayherd_herd::remote::{Storage, WorkerId};
-    use rayherd_herd::store::S3Credentials;
+    use rayherd_herd::store::S3Key;
     use rcgen::{BasicConstraints, CertificateParams, IsCa, Issuer, KeyPair};
     use rustls::pki_types::PrivatePkcs8KeyDer;
     use rustls::{ServerConfig, ServerConnection, Stream};
@@ -135,8 +135,8 @@ mod tests {
             worker: WorkerId { number: 0, session: "s".into() },
             slots: 1,
             node: None,
-            storage: Storage { bucket: "b".into(), prefix: String::new(), region: "r".into(), endpoints: vec![] },
-            credentials: S3Credentials { access_key: String::new(), secret_key: String::new(), session_token: None },
+            storage: Storage { bucket: "b".into(), region: "r".into(), ..Storage::default() },
+            credentials: S3Key { access_key: String::new(), secret_key: String::new(), session_token: None }.into(),
             scratch: "/".into(),
             token: token.to_owned(),
             authority,

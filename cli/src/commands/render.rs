@@ -20,7 +20,7 @@ use super::print;
 use crate::frames::{self, Shot};
 use crate::image_options::ImageOptions;
 use crate::interrupt::{self, Heeding};
-use crate::job_file::read_job;
+use crate::job_file::{parse_job, read_job};
 use crate::kept::{self, About};
 use crate::options::{self, CutOptions, SceneOptions, set};
 use crate::output::{distinct, png_file, replace};
@@ -28,6 +28,7 @@ use crate::progress::{Display, si};
 use crate::run_options::RunOptions;
 use crate::skip_options::SkipOptions;
 use crate::source::{self, Opened};
+use crate::storage;
 use crate::store::{S3Options, Store, Temporary};
 
 /// Objects of the prepared scene that stay in memory; what is more goes to a temporary folder.
@@ -43,14 +44,22 @@ pub const OBJECTS_IN_MEMORY: u64 = 256 << 20;
     rayherd render chest-ct --iso -789.5 --size 512x512 --target-error 0.01\n  \
     rayherd render scene.xml --nodes 4 --slots 2,2,4,4 --memory 64Mi --splits 32 --report r.json\n  \
     rayherd render -f job.yaml\n  \
+    rayherd render -f job.yaml --profile storage.yaml --s3-endpoint http://localhost:9000\n  \
     rayherd render scene.xml --spp 4096 --store results --resume")]
 pub struct Arguments {
     /// Mitsuba XML, mesh (PLY, OBJ, STL), folder of meshes, or CT volume (DICOM folder, NRRD, NIfTI)
-    #[arg(required_unless_present = "file")]
+    #[arg(required_unless_present_any = ["file", "local"])]
     scene: Option<String>,
+    /// The scene, named by a flag: with -f a local one in the place of the job's
+    #[arg(long = "scene", value_name = "PATH", conflicts_with = "scene")]
+    local: Option<String>,
     /// Take the job from a RenderJob in YAML; flags win over it
     #[arg(short, long, value_name = "YAML")]
     file: Option<PathBuf>,
+    /// With -f, fetch the job's scene from the storage of this profile: the chart's ConfigMap, or the profile.yaml in it; --s3-endpoint
+    /// names a server where the profile's are inside the cluster
+    #[arg(long, value_name = "YAML", requires = "file", conflicts_with_all = ["scene", "local"])]
+    profile: Option<PathBuf>,
     /// The EXR; the PNG goes beside it [default: ./SCENE.exr]
     #[arg(short, long, value_name = "EXR")]
     output: Option<String>,
@@ -113,7 +122,7 @@ struct SamplingOptions {
 
 /// Renders every frame of the job.
 pub fn run(arguments: &Arguments) -> anyhow::Result<ExitCode> {
-    let job = job(arguments)?;
+    let mut job = job(arguments)?;
     let settings = arguments.run.settings(&job.spec)?;
     use_threads(settings.threads)?;
     let files = frames::files(&job);
@@ -133,6 +142,16 @@ pub fn run(arguments: &Arguments) -> anyhow::Result<ExitCode> {
     distinct::check_inputs(&outputs, arguments.file.as_deref())?;
 
     let keep = &arguments.keep;
+    let origin = job.spec.scene.source.clone();
+    // goes with its folder at the end
+    let _fetched = match &arguments.profile {
+        Some(profile) => {
+            let fetched = storage::fetch(profile, keep.s3.s3_endpoint.as_deref(), &job.spec.scene.source)?;
+            job.spec.scene.source = fetched.source.to_string_lossy().into_owned();
+            Some(fetched)
+        }
+        None => None,
+    };
     let store = keep.store.as_ref().map(|address| Store::open(address, &keep.s3)).transpose()?;
     let temporary = if store.is_none() { Some(Temporary::new(OBJECTS_IN_MEMORY)?) } else { None };
     let objects = store.as_ref().map(|s| s.objects.clone()).or_else(|| temporary.as_ref().map(|t| t.objects.clone()));
@@ -149,7 +168,7 @@ pub fn run(arguments: &Arguments) -> anyhow::Result<ExitCode> {
     };
     let exposure = job.spec.image.exposure.unwrap_or(0.0);
     let named = |shot: &Shot| -> anyhow::Result<(String, About)> {
-        Ok((scene.image_name(&shot.frame)?, About::new(&job.spec.scene.source, &scene, &shot.frame)?))
+        Ok((scene.image_name(&shot.frame)?, About::new(&origin, &scene, &shot.frame)?))
     };
     let names = shots.iter().map(named).collect::<Result<Vec<_>, _>>()?;
     if let (true, Some(store), Some(place)) = (keep.resume, &store, &keep.store) {
@@ -195,14 +214,15 @@ pub fn run(arguments: &Arguments) -> anyhow::Result<ExitCode> {
 fn job(arguments: &Arguments) -> anyhow::Result<RenderJob> {
     let mut job = match &arguments.file {
         Some(file) => {
-            let job = read_job(file)?;
+            // with a profile the source is a key in the storage
+            let job = if arguments.profile.is_some() { parse_job(file)? } else { read_job(file)? };
             options::check(&job, Some(file))?;
             job
         }
         None => RenderJob::new(RenderJobSpec::default()),
     };
     let spec = &mut job.spec;
-    if let Some(scene) = &arguments.scene {
+    if let Some(scene) = arguments.scene.as_ref().or(arguments.local.as_ref()) {
         spec.scene.source.clone_from(scene);
     }
     arguments.scene_options.apply(spec);

@@ -12,6 +12,7 @@ mod guard;
 pub mod message;
 mod parts;
 mod prepare;
+pub mod profile;
 pub mod station;
 pub mod storage;
 #[cfg(test)]
@@ -21,6 +22,8 @@ pub mod turns;
 pub use depot::Depot;
 pub use fleet::Fleet;
 pub use message::{Answer, Beat, Failure, Poll, Report, Stage, Work, WorkerId};
+pub use prepare::download;
+pub use profile::{Profile, Service};
 pub use station::{Link, LinkError, Station};
 pub use storage::{Endpoint, Storage};
 pub use turns::Turns;

@@ -1,7 +1,6 @@
 //! Preparing a scene that lies in the storage, and putting its blocks on the nodes where they belong.
 
 use std::fs::{self, File};
-use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, UNIX_EPOCH};
@@ -87,7 +86,10 @@ pub fn prepare_scene(
 ///
 /// A file's time is made from its content, so that the scene's fingerprint (paths, sizes, times) sees contents, on every
 /// machine alike.
-fn download(store: &NodeView, runtime: &Handle, source: &str, folder: &Path) -> Result<PathBuf, JobError> {
+///
+/// # Errors
+/// When there is no such source, or it cannot be read or written down.
+pub fn download(store: &NodeView, runtime: &Handle, source: &str, folder: &Path) -> Result<PathBuf, JobError> {
     let source = source.trim_end_matches('/');
     let wrong = |why: &str| JobError::Settings(format!("spec.scene.source is {source:?}: {why}"));
     check_key(source).map_err(|e| wrong(&format!("on a cluster it is a key in the job's storage ({e})")))?;
@@ -102,13 +104,12 @@ fn download(store: &NodeView, runtime: &Handle, source: &str, folder: &Path) -> 
     // files that a scene file names lie beside or below it; a folder is a scene by itself
     let wanted = listed.into_iter().filter(|(key, _)| if is_file { true } else { key.starts_with(&below) });
     for (key, _) in wanted {
-        let body = runtime.block_on(store.get(&key))?;
         let path = folder.join(&key);
         let io = |e: std::io::Error| JobError::Settings(format!("cannot write {}: {e}", path.display()));
         fs::create_dir_all(path.parent().unwrap_or(folder)).map_err(io)?;
-        let mut file = File::create(&path).map_err(io)?;
-        file.write_all(&body).map_err(io)?;
-        let hash = blake3::hash(&body);
+        runtime.block_on(store.get_file(&key, &path))?;
+        let file = File::options().read(true).write(true).open(&path).map_err(io)?;
+        let hash = blake3::Hasher::new().update_reader(&file).map_err(io)?.finalize();
         let word = |i: usize| u32::from_le_bytes(std::array::from_fn(|k| hash.as_bytes()[i + k]));
         let time = Duration::new(u64::from(word(0) >> 1), word(4) % 1_000_000_000);
         file.set_modified(UNIX_EPOCH + time).map_err(io)?;

@@ -35,7 +35,7 @@ impl Endpoint {
 }
 
 /// All servers, in the order that everybody numbers them by, and where the data is in each.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "camelCase")]
 pub struct Storage {
     /// Name of the bucket in each.
@@ -48,6 +48,12 @@ pub struct Storage {
     pub region: String,
     /// The servers.
     pub endpoints: Vec<Endpoint>,
+    /// Whether a cloud says who the operator and the workers are; a key of the job's Secret does otherwise.
+    #[serde(default)]
+    pub identity: bool,
+    /// The service account that workers run as, for that; the namespace's default one if none.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub service_account: Option<String>,
 }
 
 fn default_region() -> String {

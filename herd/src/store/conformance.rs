@@ -47,7 +47,12 @@ async fn reads_back_what_a_file_held(store: &dyn BlockStore) {
         let key = "conformance/file";
         store.put_file(key, &file).await.unwrap();
         assert!(store.get(key).await.unwrap() == body, "{length}");
+        // over what is there
+        let copy = folder.path().join("copy");
+        assert_eq!(store.get_file(key, &copy).await.unwrap(), length as u64);
+        assert!(std::fs::read(&copy).unwrap() == body, "{length}");
         store.delete(&[key.to_owned()]).await.unwrap();
+        assert!(matches!(store.get_file(key, &copy).await, Err(StoreError::NotFound { .. })));
     }
     assert!(store.put_file("conformance/file", &folder.path().join("none")).await.is_err());
 }

@@ -4,7 +4,7 @@
 //! place and syncs the folder: readers see the old object, the new one or none, also after the power was cut.
 
 use std::fs::{self, File};
-use std::io::{self, ErrorKind, Write};
+use std::io::{self, ErrorKind};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -87,6 +87,12 @@ impl BlockStore for DirectoryStore {
         self.blocking("put", key, move |inner| inner.put(&name, &body)).await
     }
 
+    async fn put_file(&self, key: &str, file: &Path) -> Result<(), StoreError> {
+        check_key(key)?;
+        let (name, file) = (key.to_owned(), file.to_owned());
+        self.blocking("put", key, move |inner| inner.put_file(&name, &file)).await
+    }
+
     async fn get(&self, key: &str) -> Result<Bytes, StoreError> {
         check_key(key)?;
         let name = key.to_owned();
@@ -123,17 +129,29 @@ impl Inner {
     }
 
     fn put(&self, key: &str, body: &[u8]) -> Result<(), StoreError> {
+        self.put_by(key, body.len() as u64, |temporary| self.write(temporary, &mut &body[..]))
+    }
+
+    /// Through a buffer: a file of any size.
+    fn put_file(&self, key: &str, file: &Path) -> Result<(), StoreError> {
+        let unreadable = |e: &io::Error| super::unreadable(self.root.display().to_string(), file, e);
+        let mut source = File::open(file).map_err(|e| unreadable(&e))?;
+        let bytes = source.metadata().map_err(|e| unreadable(&e))?.len();
+        self.put_by(key, bytes, |temporary| self.write(temporary, &mut source))
+    }
+
+    fn put_by(&self, key: &str, bytes: u64, write: impl FnOnce(&Path) -> io::Result<()>) -> Result<(), StoreError> {
         let number = self.next.fetch_add(1, Ordering::Relaxed);
         let temporary = self.root.join(TEMPORARY).join(format!("{:016x}-{number}", self.run));
-        let written = self.write(&temporary, body).and_then(|()| self.rename(&temporary, key));
+        let written = write(&temporary).and_then(|()| self.rename(&temporary, key));
         written.map_err(|e| {
             // what is left of a failed put would only take room; if even that fails, `open` removes it later
             let _ = fs::remove_file(&temporary);
-            self.error("put", key, body.len() as u64, &e)
+            self.error("put", key, bytes, &e)
         })
     }
 
-    fn write(&self, temporary: &Path, body: &[u8]) -> io::Result<()> {
+    fn write(&self, temporary: &Path, body: &mut dyn io::Read) -> io::Result<()> {
         let open = || File::options().write(true).create_new(true).open(temporary);
         let mut file = match open() {
             // somebody cleaned the store while we were running
@@ -143,7 +161,7 @@ impl Inner {
             }
             other => other?,
         };
-        file.write_all(body)?;
+        io::copy(body, &mut file)?;
         if self.sync { file.sync_all() } else { Ok(()) }
     }
 

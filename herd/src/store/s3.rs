@@ -1,10 +1,15 @@
 //! Objects in an S3 bucket. Only this file knows S3.
 //!
-//! Plain S3 and nothing newer than what MinIO of 2021 has: one put, get, head, list (version 2) and batch delete.
+//! Plain S3 and nothing newer than what MinIO of 2021 has: put (large files in parts), get, head, list (version 2) and batch delete.
+
+mod identity;
+mod multipart;
 
 use std::fs::File;
 use std::io::Read;
 use std::path::Path;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 
 use async_trait::async_trait;
@@ -13,7 +18,7 @@ use aws_sdk_s3::config::http::HttpResponse;
 use aws_sdk_s3::config::retry::RetryConfig;
 use aws_sdk_s3::config::timeout::TimeoutConfig;
 use aws_sdk_s3::config::{
-    BehaviorVersion, Credentials, Region, RequestChecksumCalculation, ResponseChecksumValidation, SharedHttpClient,
+    BehaviorVersion, Region, RequestChecksumCalculation, ResponseChecksumValidation, SharedHttpClient,
 };
 use aws_sdk_s3::error::{ProvideErrorMetadata, SdkError};
 use aws_sdk_s3::primitives::ByteStream;
@@ -22,8 +27,11 @@ use aws_smithy_http_client::tls::Provider;
 use aws_smithy_http_client::tls::rustls_provider::CryptoMode;
 use bytes::{Bytes, BytesMut};
 use md5::{Digest, Md5};
+use tokio::io::AsyncWriteExt;
 
 use super::{BlockStore, StoreError, check_key, check_prefix};
+pub use identity::{Identity, S3Credentials, S3Key};
+use multipart::Parts;
 
 /// Most that S3 takes in one put.
 const LARGEST: u64 = 5 << 30;
@@ -57,27 +65,10 @@ pub struct S3Settings {
     pub credentials: S3Credentials,
 }
 
-/// An access key. The secrets do not show in `Debug`.
-#[derive(Clone, PartialEq, Eq)]
-pub struct S3Credentials {
-    /// Its public part.
-    pub access_key: String,
-    /// Its secret part.
-    pub secret_key: String,
-    /// For temporary keys.
-    pub session_token: Option<String>,
-}
-
-impl std::fmt::Debug for S3Credentials {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.debug_struct("S3Credentials").field("access_key", &self.access_key).finish_non_exhaustive()
-    }
-}
-
 impl S3Settings {
     /// From `s3://bucket/prefix`, an endpoint (else `AWS_ENDPOINT_URL_S3`, `AWS_ENDPOINT_URL`, else AWS itself), and
     /// the environment: `AWS_REGION` (or `AWS_DEFAULT_REGION`, else us-east-1), `AWS_ACCESS_KEY_ID`,
-    /// `AWS_SECRET_ACCESS_KEY`, `AWS_SESSION_TOKEN`.
+    /// `AWS_SECRET_ACCESS_KEY`, `AWS_SESSION_TOKEN`; where there is no key, the identity that a cloud gives ([`Identity`]).
     pub fn from_url(url: &str, endpoint: Option<&str>) -> Result<Self, StoreError> {
         Self::from_url_and(url, endpoint, |name| std::env::var(name).ok().filter(|value| !value.is_empty()))
     }
@@ -92,10 +83,7 @@ impl S3Settings {
         let (bucket, prefix) = path.split_once('/').unwrap_or((path, ""));
         let endpoint = endpoint.map(str::to_owned);
         let endpoint = endpoint.or_else(|| variable("AWS_ENDPOINT_URL_S3")).or_else(|| variable("AWS_ENDPOINT_URL"));
-        let key = |name: &str| {
-            let hint = "set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY";
-            variable(name).ok_or_else(|| wrong(format!("no credentials: {name} is not set ({hint})")))
-        };
+        let credentials = S3Credentials::from_variables(&variable).map_err(wrong)?;
         let settings = S3Settings {
             bucket: bucket.to_owned(),
             prefix: prefix.trim_end_matches('/').to_owned(),
@@ -105,11 +93,7 @@ impl S3Settings {
             // AWS wants names of buckets in the host; everybody else works without DNS entries per bucket
             path_style: endpoint.is_some(),
             endpoint,
-            credentials: S3Credentials {
-                access_key: key("AWS_ACCESS_KEY_ID")?,
-                secret_key: key("AWS_SECRET_ACCESS_KEY")?,
-                session_token: variable("AWS_SESSION_TOKEN"),
-            },
+            credentials,
         };
         settings.check()?;
         Ok(settings)
@@ -154,6 +138,10 @@ pub struct S3Store {
     /// Empty, or ending with a slash.
     prefix: String,
     name: String,
+    /// Whether keys are asked for elsewhere, where that may fail for now.
+    is_identity: bool,
+    parts: Parts,
+    sent: Arc<AtomicU64>,
 }
 
 impl S3Store {
@@ -162,7 +150,10 @@ impl S3Store {
         settings.check()?;
         Ok(S3Store {
             client: client(&settings),
+            is_identity: matches!(settings.credentials, S3Credentials::Identity(_)),
             name: settings.url(),
+            parts: Parts::default(),
+            sent: Arc::default(),
             prefix: if settings.prefix.is_empty() { String::new() } else { settings.prefix + "/" },
             bucket: settings.bucket,
         })
@@ -177,6 +168,23 @@ impl S3Store {
         Ok(store)
     }
 
+    /// Makes the bucket, unless it is there.
+    ///
+    /// # Errors
+    /// When the server does not do it.
+    pub async fn make_bucket(&self) -> Result<(), StoreError> {
+        match self.client.create_bucket().bucket(&self.bucket).send().await {
+            Ok(_) => Ok(()),
+            Err(e) if e.code() == Some("BucketAlreadyOwnedByYou") => Ok(()),
+            Err(e) => Err(self.failure("make the bucket", "", 0, e)),
+        }
+    }
+
+    /// Bytes of files that were put so far, and of parts of them that were found there; goes up while a file is put.
+    pub fn sent(&self) -> Arc<AtomicU64> {
+        self.sent.clone()
+    }
+
     fn path(&self, key: &str) -> String {
         format!("{}{key}", self.prefix)
     }
@@ -189,7 +197,8 @@ impl S3Store {
         let (store, key) = (self.name.clone(), key.to_owned());
         let service = match &error {
             SdkError::ServiceError(e) => e,
-            SdkError::ConstructionFailure(_) => {
+            // an identity is asked for first: whoever gives it may not answer now
+            SdkError::ConstructionFailure(_) if !self.is_identity => {
                 return StoreError::Denied { store, action, key, message: causes(&error) };
             }
             // no answer, half an answer, none in time
@@ -255,6 +264,33 @@ impl S3Store {
         StoreError::Unavailable { store: self.name.clone(), action, key: key.to_owned(), message: message.into() }
     }
 
+    /// The body of an object, and how long the server says that it is.
+    async fn open(&self, key: &str) -> Result<(ByteStream, u64), StoreError> {
+        check_key(key)?;
+        let request = self.client.get_object().bucket(&self.bucket).key(self.path(key)).send();
+        let response = request.await.map_err(|e| self.failure("get", key, 0, e))?;
+        let announced = response.content_length().and_then(|n| u64::try_from(n).ok());
+        let length = announced.ok_or_else(|| self.broken("get", key, "the answer does not say how long it is"))?;
+        Ok((response.body, length))
+    }
+
+    /// The next part of a body of which so many bytes have come; none at its end.
+    async fn next(
+        &self,
+        key: &str,
+        body: &mut ByteStream,
+        came: u64,
+        length: u64,
+    ) -> Result<Option<Bytes>, StoreError> {
+        match body.try_next().await {
+            Ok(Some(part)) if came + part.len() as u64 <= length => Ok(Some(part)),
+            Ok(Some(_)) => Err(self.broken("get", key, format!("more than {length} bytes came"))),
+            Ok(None) if came == length => Ok(None),
+            Ok(None) => Err(self.broken("get", key, format!("{came} of {length} bytes came"))),
+            Err(e) => Err(self.broken("get", key, causes(&e))),
+        }
+    }
+
     async fn delete_batch(&self, keys: &[String]) -> Result<(), StoreError> {
         let first = &keys[0];
         let unbuildable = |e: aws_sdk_s3::error::BuildError| self.broken("delete", first, e.to_string());
@@ -297,6 +333,10 @@ impl BlockStore for S3Store {
     async fn put_file(&self, key: &str, file: &Path) -> Result<(), StoreError> {
         check_key(key)?;
         let failed = |e: &std::io::Error| super::unreadable(self.describe(), file, e);
+        let length = tokio::fs::metadata(file).await.map_err(|e| failed(&e))?.len();
+        if length > self.parts.above {
+            return self.put_parts(key, file, length).await;
+        }
         let path = file.to_owned();
         let summed = tokio::task::spawn_blocking(move || sum_of(&path)).await;
         let (bytes, sum) = summed.map_err(|e| self.broken("put", key, e.to_string()))?.map_err(|e| failed(&e))?;
@@ -309,30 +349,35 @@ impl BlockStore for S3Store {
             .config_override(patient(bytes))
             .send()
             .await
-            .map(drop)
-            .map_err(|e| self.failure("put", key, bytes, e))
+            .map_err(|e| self.failure("put", key, bytes, e))?;
+        self.sent.fetch_add(bytes, Ordering::Relaxed);
+        Ok(())
     }
 
     async fn get(&self, key: &str) -> Result<Bytes, StoreError> {
-        check_key(key)?;
-        let request = self.client.get_object().bucket(&self.bucket).key(self.path(key)).send();
-        let mut response = request.await.map_err(|e| self.failure("get", key, 0, e))?;
-        let announced = response.content_length().and_then(|n| u64::try_from(n).ok());
-        let length = announced.ok_or_else(|| self.broken("get", key, "the answer does not say how long it is"))?;
+        let (mut body, length) = self.open(key).await?;
         if length > LARGEST {
-            return Err(self.broken("get", key, format!("{length} bytes: nothing that large was put")));
+            return Err(self.broken("get", key, format!("{length} bytes: more than is read into memory")));
         }
         // what a server announces is not memory yet
-        let mut body = BytesMut::with_capacity(length.min(FIRST_ALLOCATION) as usize);
-        loop {
-            match response.body.try_next().await {
-                Ok(Some(part)) if (body.len() + part.len()) as u64 <= length => body.extend_from_slice(&part),
-                Ok(Some(_)) => return Err(self.broken("get", key, format!("more than {length} bytes came"))),
-                Ok(None) if body.len() as u64 == length => return Ok(body.freeze()),
-                Ok(None) => return Err(self.broken("get", key, format!("{} of {length} bytes came", body.len()))),
-                Err(e) => return Err(self.broken("get", key, causes(&e))),
-            }
+        let mut whole = BytesMut::with_capacity(length.min(FIRST_ALLOCATION) as usize);
+        while let Some(part) = self.next(key, &mut body, whole.len() as u64, length).await? {
+            whole.extend_from_slice(&part);
         }
+        Ok(whole.freeze())
+    }
+
+    async fn get_file(&self, key: &str, file: &Path) -> Result<u64, StoreError> {
+        let failed = |e: std::io::Error| super::unwritable(self.describe(), file, &e);
+        let (mut body, length) = self.open(key).await?;
+        let mut to = tokio::fs::File::create(file).await.map_err(failed)?;
+        let mut bytes = 0;
+        while let Some(part) = self.next(key, &mut body, bytes, length).await? {
+            to.write_all(&part).await.map_err(failed)?;
+            bytes += part.len() as u64;
+        }
+        to.flush().await.map_err(failed)?;
+        Ok(bytes)
     }
 
     async fn size(&self, key: &str) -> Result<Option<u64>, StoreError> {
@@ -432,18 +477,10 @@ fn sum_of(file: &Path) -> std::io::Result<(u64, String)> {
 
 /// The one place where S3 clients are made.
 fn client(settings: &S3Settings) -> Client {
-    let credentials = &settings.credentials;
-    let credentials = Credentials::new(
-        &credentials.access_key,
-        &credentials.secret_key,
-        credentials.session_token.clone(),
-        None,
-        "rayherd settings",
-    );
     let mut config = aws_sdk_s3::Config::builder()
         .behavior_version(BehaviorVersion::v2026_01_12())
         .http_client(http_client(settings))
-        .credentials_provider(credentials)
+        .credentials_provider(identity::provider(&settings.credentials, &settings.region, tls_client()))
         .region(Region::new(settings.region.clone()))
         .force_path_style(settings.path_style)
         // MinIO of 2021 and others do not know the checksums that the SDK adds by default since 2025
@@ -463,11 +500,15 @@ fn client(settings: &S3Settings) -> Client {
 
 /// Plain HTTP where the endpoint says so; else TLS by rustls with ring, the one crypto provider of the program.
 fn http_client(settings: &S3Settings) -> SharedHttpClient {
-    let builder = aws_smithy_http_client::Builder::new();
     if settings.endpoint.as_deref().is_some_and(|e| e.starts_with("http://")) {
-        return builder.build_http();
+        return aws_smithy_http_client::Builder::new().build_http();
     }
-    builder.tls_provider(Provider::Rustls(CryptoMode::Ring)).build_https()
+    tls_client()
+}
+
+/// Speaks TLS, and plain HTTP where an address says so.
+fn tls_client() -> SharedHttpClient {
+    aws_smithy_http_client::Builder::new().tls_provider(Provider::Rustls(CryptoMode::Ring)).build_https()
 }
 
 /// An error with its causes in one line.

@@ -1,6 +1,6 @@
 //! An S3 server in this process, for tests: buckets in memory behind real HTTP on loopback, with faults on request.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
@@ -12,15 +12,20 @@ use hyper::body::Incoming;
 use hyper::service::service_fn;
 use hyper::{Method, Request};
 use hyper_util::rt::TokioIo;
+use md5::{Digest, Md5};
 use s3s::auth::SimpleAuth;
 use s3s::dto::{
-    DeleteObjectsInput, DeleteObjectsOutput, GetObjectInput, GetObjectOutput, HeadObjectInput, HeadObjectOutput,
-    ListObjectsV2Input, ListObjectsV2Output, Object, PutObjectInput, PutObjectOutput, StreamingBlob,
+    AbortMultipartUploadInput, AbortMultipartUploadOutput, CompleteMultipartUploadInput, CompleteMultipartUploadOutput,
+    CreateBucketInput, CreateBucketOutput, CreateMultipartUploadInput, CreateMultipartUploadOutput, DeleteObjectsInput,
+    DeleteObjectsOutput, ETag, GetObjectInput, GetObjectOutput, HeadObjectInput, HeadObjectOutput,
+    ListMultipartUploadsInput, ListMultipartUploadsOutput, ListObjectsV2Input, ListObjectsV2Output, ListPartsInput,
+    ListPartsOutput, MultipartUpload, Object, Part, PutObjectInput, PutObjectOutput, StreamingBlob, UploadPartInput,
+    UploadPartOutput,
 };
 use s3s::service::{S3Service, S3ServiceBuilder};
 use s3s::{Body, HttpError, HttpResponse, S3, S3Request, S3Response, S3Result, s3_error};
 
-use super::{S3Credentials, S3Settings};
+use super::{S3Key, S3Settings};
 
 /// The name of the bucket that every server has.
 pub const BUCKET: &str = "test-bucket";
@@ -49,9 +54,16 @@ pub struct S3Server {
     task: tokio::task::JoinHandle<()>,
 }
 
+/// Key and parts of an upload by its name.
+type Uploads = BTreeMap<String, (String, BTreeMap<i32, Bytes>)>;
+
 #[derive(Default)]
 struct State {
     objects: Mutex<BTreeMap<String, Bytes>>,
+    /// Beside [`BUCKET`]; all share their objects.
+    buckets: Mutex<BTreeSet<String>>,
+    uploads: Mutex<Uploads>,
+    parts: AtomicU64,
     faults: Mutex<S3Faults>,
     requests: AtomicU64,
     injected: AtomicU64,
@@ -80,12 +92,13 @@ impl S3Server {
             endpoint: Some(self.endpoint.clone()),
             region: "us-east-1".to_owned(),
             path_style: true,
-            credentials: S3Credentials {
-                access_key: "test-key".to_owned(),
-                secret_key: "test-secret".to_owned(),
-                session_token: None,
-            },
+            credentials: Self::key().into(),
         }
+    }
+
+    /// Whom it knows.
+    pub fn key() -> S3Key {
+        S3Key { access_key: "test-key".to_owned(), secret_key: "test-secret".to_owned(), session_token: None }
     }
 
     /// From now on, these.
@@ -96,6 +109,12 @@ impl S3Server {
     /// Requests that came, and how many of them went wrong on purpose.
     pub fn requests(&self) -> (u64, u64) {
         (self.state.requests.load(Ordering::Relaxed), self.state.injected.load(Ordering::Relaxed))
+    }
+
+    /// Parts of uploads that came, and keys of uploads that have not ended.
+    pub fn uploads(&self) -> (u64, Vec<String>) {
+        let unfinished = lock(&self.state.uploads).values().map(|(key, _)| key.clone()).collect();
+        (self.state.parts.load(Ordering::Relaxed), unfinished)
     }
 
     /// Puts an object past every rule, as another program would.
@@ -189,8 +208,35 @@ struct Buckets(Arc<State>);
 
 impl Buckets {
     fn objects(&self, bucket: &str) -> S3Result<MutexGuard<'_, BTreeMap<String, Bytes>>> {
-        if bucket == BUCKET { Ok(lock(&self.0.objects)) } else { Err(s3_error!(NoSuchBucket)) }
+        let is_there = bucket == BUCKET || lock(&self.0.buckets).contains(bucket);
+        if is_there { Ok(lock(&self.0.objects)) } else { Err(s3_error!(NoSuchBucket)) }
     }
+
+    /// What to do with an upload of this name and key.
+    fn upload<T>(&self, name: &str, key: &str, with: impl FnOnce(&mut BTreeMap<i32, Bytes>) -> T) -> S3Result<T> {
+        match lock(&self.0.uploads).get_mut(name) {
+            Some((of, parts)) if of == key => Ok(with(parts)),
+            _ => Err(s3_error!(NoSuchUpload)),
+        }
+    }
+}
+
+async fn read(body: Option<StreamingBlob>, length: Option<i64>) -> S3Result<Bytes> {
+    let mut whole = Vec::new();
+    if let Some(mut parts) = body {
+        while let Some(part) = parts.next().await {
+            whole.extend_from_slice(&part.map_err(|_| s3_error!(IncompleteBody))?);
+        }
+    }
+    if length.is_some_and(|n| n != whole.len() as i64) {
+        return Err(s3_error!(IncompleteBody));
+    }
+    Ok(whole.into())
+}
+
+/// What S3 calls a part, or an object that was put whole.
+fn tag(body: &[u8]) -> ETag {
+    ETag::Strong(Md5::digest(body).iter().map(|b| format!("{b:02x}")).collect())
 }
 
 #[async_trait]
@@ -198,17 +244,107 @@ impl S3 for Buckets {
     async fn put_object(&self, request: S3Request<PutObjectInput>) -> S3Result<S3Response<PutObjectOutput>> {
         let input = request.input;
         drop(self.objects(&input.bucket)?);
-        let mut body = Vec::new();
-        if let Some(mut parts) = input.body {
-            while let Some(part) = parts.next().await {
-                body.extend_from_slice(&part.map_err(|_| s3_error!(IncompleteBody))?);
-            }
-        }
-        if input.content_length.is_some_and(|n| n != body.len() as i64) {
-            return Err(s3_error!(IncompleteBody));
-        }
-        self.objects(&input.bucket)?.insert(input.key, body.into());
+        let body = read(input.body, input.content_length).await?;
+        self.objects(&input.bucket)?.insert(input.key, body);
         Ok(S3Response::new(PutObjectOutput::default()))
+    }
+
+    async fn create_bucket(&self, request: S3Request<CreateBucketInput>) -> S3Result<S3Response<CreateBucketOutput>> {
+        let bucket = request.input.bucket;
+        if bucket == BUCKET || !lock(&self.0.buckets).insert(bucket) {
+            return Err(s3_error!(BucketAlreadyOwnedByYou));
+        }
+        Ok(S3Response::new(CreateBucketOutput::default()))
+    }
+
+    async fn create_multipart_upload(
+        &self,
+        request: S3Request<CreateMultipartUploadInput>,
+    ) -> S3Result<S3Response<CreateMultipartUploadOutput>> {
+        drop(self.objects(&request.input.bucket)?);
+        let mut uploads = lock(&self.0.uploads);
+        let name = format!("upload-{}", self.0.requests.load(Ordering::Relaxed));
+        uploads.insert(name.clone(), (request.input.key, BTreeMap::new()));
+        Ok(S3Response::new(CreateMultipartUploadOutput { upload_id: Some(name), ..Default::default() }))
+    }
+
+    async fn upload_part(&self, request: S3Request<UploadPartInput>) -> S3Result<S3Response<UploadPartOutput>> {
+        let input = request.input;
+        self.upload(&input.upload_id, &input.key, |_| ())?;
+        let body = read(input.body, input.content_length).await?;
+        self.0.parts.fetch_add(1, Ordering::Relaxed);
+        let e_tag = Some(tag(&body));
+        self.upload(&input.upload_id, &input.key, |parts| parts.insert(input.part_number, body))?;
+        Ok(S3Response::new(UploadPartOutput { e_tag, ..Default::default() }))
+    }
+
+    /// Two to a page.
+    async fn list_parts(&self, request: S3Request<ListPartsInput>) -> S3Result<S3Response<ListPartsOutput>> {
+        let input = request.input;
+        let after = input.part_number_marker.and_then(|m| m.to_string().parse().ok()).unwrap_or(0);
+        let mut found: Vec<Part> = self.upload(&input.upload_id, &input.key, |parts| {
+            let later = parts.range(after + 1..).take(3);
+            let part = |(number, body): (&i32, &Bytes)| Part {
+                part_number: Some(*number),
+                size: Some(body.len() as i64),
+                e_tag: Some(tag(body)),
+                ..Default::default()
+            };
+            later.map(part).collect()
+        })?;
+        let truncated = found.len() > 2;
+        found.truncate(2);
+        let last = found.last().and_then(|p| p.part_number).filter(|_| truncated);
+        let output = ListPartsOutput {
+            is_truncated: Some(truncated),
+            next_part_number_marker: last.map(|n| n.to_string().parse().expect("a number")),
+            parts: Some(found),
+            ..Default::default()
+        };
+        Ok(S3Response::new(output))
+    }
+
+    async fn list_multipart_uploads(
+        &self,
+        request: S3Request<ListMultipartUploadsInput>,
+    ) -> S3Result<S3Response<ListMultipartUploadsOutput>> {
+        let prefix = request.input.prefix.unwrap_or_default();
+        let uploads = lock(&self.0.uploads);
+        let found = uploads.iter().filter(|(_, (key, _))| key.starts_with(&prefix));
+        let upload = |(name, (key, _)): (&String, &(String, BTreeMap<i32, Bytes>))| MultipartUpload {
+            key: Some(key.clone()),
+            upload_id: Some(name.clone()),
+            ..Default::default()
+        };
+        let output = ListMultipartUploadsOutput { uploads: Some(found.map(upload).collect()), ..Default::default() };
+        Ok(S3Response::new(output))
+    }
+
+    async fn complete_multipart_upload(
+        &self,
+        request: S3Request<CompleteMultipartUploadInput>,
+    ) -> S3Result<S3Response<CompleteMultipartUploadOutput>> {
+        let input = request.input;
+        let wanted = input.multipart_upload.and_then(|u| u.parts).unwrap_or_default();
+        let joined = self.upload(&input.upload_id, &input.key, |parts| {
+            let one = |wanted: &s3s::dto::CompletedPart| {
+                let body = parts.get(&wanted.part_number?)?;
+                (wanted.e_tag.as_ref()? == &tag(body)).then(|| body.clone())
+            };
+            wanted.iter().map(one).collect::<Option<Vec<Bytes>>>()
+        })?;
+        let joined = joined.filter(|parts| !parts.is_empty()).ok_or_else(|| s3_error!(InvalidPart))?;
+        self.objects(&input.bucket)?.insert(input.key, joined.concat().into());
+        lock(&self.0.uploads).remove(&input.upload_id);
+        Ok(S3Response::new(CompleteMultipartUploadOutput::default()))
+    }
+
+    async fn abort_multipart_upload(
+        &self,
+        request: S3Request<AbortMultipartUploadInput>,
+    ) -> S3Result<S3Response<AbortMultipartUploadOutput>> {
+        lock(&self.0.uploads).remove(&request.input.upload_id).ok_or_else(|| s3_error!(NoSuchUpload))?;
+        Ok(S3Response::new(AbortMultipartUploadOutput::default()))
     }
 
     async fn get_object(&self, request: S3Request<GetObjectInput>) -> S3Result<S3Response<GetObjectOutput>> {

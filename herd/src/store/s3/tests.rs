@@ -9,6 +9,10 @@ fn soon() -> RetryPolicy {
     RetryPolicy { attempts: 12, first: Duration::from_millis(1), longest: Duration::from_millis(8) }
 }
 
+fn wrong_key() -> S3Credentials {
+    S3Key { secret_key: "wrong".to_owned(), ..S3Server::key() }.into()
+}
+
 #[tokio::test]
 async fn conforms() {
     let server = S3Server::start().await;
@@ -53,7 +57,7 @@ async fn what_goes_wrong_is_named_by_what_can_be_done() {
     server.set_faults(S3Faults::default());
     assert_eq!(store.size("l").await.unwrap(), Some(0), "the reply was lost, not the object");
 
-    settings.credentials.secret_key = "wrong".to_owned();
+    settings.credentials = wrong_key();
     let error = S3Store::connect(settings.clone()).await.unwrap_err();
     assert!(matches!(&error, StoreError::Denied { .. }), "{error:?}");
     settings = S3Settings { bucket: "no-such-bucket".to_owned(), ..server.settings("") };
@@ -100,13 +104,110 @@ async fn a_refusal_without_a_reason_passes_one_with_a_reason_does_not() {
     assert_eq!(store.get("k").await.unwrap(), "a body");
 
     let mut wrong = settings;
-    wrong.credentials.secret_key = "wrong".to_owned();
+    wrong.credentials = wrong_key();
     let store = S3Store::new(wrong).unwrap();
     for error in [store.size("k").await.err(), store.put("k", Bytes::new()).await.err()] {
         let error = error.unwrap();
         assert!(matches!(&error, StoreError::Denied { .. }), "{error:?}");
         assert!(error.to_string().contains("SignatureDoesNotMatch"), "{error}");
     }
+}
+
+/// A store that sends files in parts of so many bytes.
+async fn in_parts(server: &S3Server, least: u64) -> S3Store {
+    S3Store { parts: Parts { above: least, least }, ..S3Store::connect(server.settings("p")).await.unwrap() }
+}
+
+#[tokio::test]
+async fn a_large_file_goes_in_parts_and_on_where_it_broke_off() {
+    let server = S3Server::start().await;
+    let store = in_parts(&server, 1000).await;
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("file");
+    // the last part is shorter; no two are alike
+    let body: Vec<u8> = (0..7600_u32).map(|i| (i % 251) as u8 ^ (i / 1000) as u8).collect();
+    std::fs::write(&file, &body).unwrap();
+    store.put_file("whole", &file).await.unwrap();
+    assert!(store.get("whole").await.unwrap() == body[..]);
+    assert_eq!((server.uploads(), store.sent().load(Ordering::Relaxed)), ((8, vec![]), 7600));
+
+    // breaks off: some parts are there, and the upload stays
+    let mut seed = 0;
+    let before = loop {
+        server.set_faults(S3Faults { seed, unavailable: 250, ..S3Faults::default() });
+        let before = server.uploads().0;
+        let broken = store.put_file("on", &file).await;
+        let (after, left) = server.uploads();
+        seed += 1;
+        if matches!(broken, Err(StoreError::Unavailable { .. })) && !left.is_empty() && after > before + 1 {
+            break after;
+        }
+        // all at once, or nothing yet: another draw
+        server.set_faults(S3Faults::default());
+        store.put_file("on", &file).await.unwrap();
+        store.delete(&["on".to_owned()]).await.unwrap();
+        assert!(seed < 200, "no draw of faults breaks it off in the middle");
+    };
+    server.set_faults(S3Faults::default());
+    let (there, sent) = (store.size("on").await.unwrap(), store.sent().load(Ordering::Relaxed));
+    assert_eq!(there, None, "not there by half");
+    // another process
+    in_parts(&server, 1000).await.put_file("on", &file).await.unwrap();
+    let (after, left) = server.uploads();
+    assert!(after - before < 8, "{} parts were sent again", after - before);
+    assert_eq!((left, store.sent().load(Ordering::Relaxed)), (vec![], sent));
+    assert!(store.get("on").await.unwrap() == body[..]);
+}
+
+/// What the parts that are there hold counts, not that they are there.
+#[tokio::test]
+async fn an_upload_of_another_file_is_not_gone_on_with() {
+    let server = S3Server::start().await;
+    let store = in_parts(&server, 1000).await;
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("file");
+    let upload = store.begin("k").await.unwrap();
+    std::fs::write(&file, [1; 2500]).unwrap();
+    store.send_all("k", &file, 2500, &upload, &Default::default()).await.unwrap();
+    let body: Vec<u8> = [[1; 1000], [2; 1000]].concat();
+    std::fs::write(&file, &body).unwrap();
+    store.put_file("k", &file).await.unwrap();
+    assert!(store.get("k").await.unwrap() == body[..]);
+    // the second part alone was another one: 3, and 1
+    assert_eq!(server.uploads(), (4, vec![]));
+    // nothing is left of what cannot be: the file ends before it should
+    let upload = store.begin("l").await.unwrap();
+    let error = store.send_all("l", &file, 2500, &upload, &Default::default()).await.unwrap_err();
+    assert!(matches!(error, StoreError::Misconfigured { .. }), "{error:?}");
+    assert!(store.put_parts("l", &file, 2500).await.is_err());
+    assert_eq!(server.uploads().1, Vec::<String>::new(), "given up");
+}
+
+#[tokio::test]
+async fn files_in_parts_over_a_bad_network() {
+    let server = S3Server::start().await;
+    let store = Retrying::new(Arc::new(in_parts(&server, 1000).await), RetryPolicy { attempts: 200, ..soon() });
+    let latency = Duration::from_micros(200);
+    server.set_faults(S3Faults { seed: 11, unavailable: 100, starting: 40, lost_reply: 100, cut_body: 60, latency });
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("file");
+    for number in 0..4 {
+        let body: Vec<u8> = (0..9100 + number).map(|i| (i % 251) as u8).collect();
+        std::fs::write(&file, &body).unwrap();
+        store.put_file("k", &file).await.unwrap();
+        assert!(store.get("k").await.unwrap() == body[..]);
+    }
+    assert!(store.retries() > 4, "{} retries", store.retries());
+}
+
+#[tokio::test]
+async fn a_bucket_is_made_once() {
+    let server = S3Server::start().await;
+    let store = S3Store::new(S3Settings { bucket: "another".to_owned(), ..server.settings("") }).unwrap();
+    assert!(matches!(store.list("").await, Err(StoreError::NoBucket { .. })));
+    store.make_bucket().await.unwrap();
+    store.make_bucket().await.unwrap();
+    assert_eq!(store.list("").await.unwrap(), []);
 }
 
 /// The TLS client is there and its crypto provider chosen: without one, rustls panics at the first connection.
@@ -160,6 +261,21 @@ fn settings_come_from_url_and_environment() {
     }
     let error = S3Settings::from_url_and("s3://scenes", None, |_| None).unwrap_err().to_string();
     assert!(error.contains("AWS_ACCESS_KEY_ID is not set"), "{error}");
+
+    // a cloud's identity where there is no key, and only there
+    for (names, want) in [
+        (&["AWS_WEB_IDENTITY_TOKEN_FILE"][..], Some(Identity::WebToken)),
+        (&["AWS_CONTAINER_CREDENTIALS_FULL_URI"], Some(Identity::Container)),
+        (&["AWS_CONTAINER_CREDENTIALS_RELATIVE_URI"], Some(Identity::Container)),
+        (&["AWS_WEB_IDENTITY_TOKEN_FILE", "AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"], None),
+    ] {
+        let variable = |name: &str| names.contains(&name).then(|| "x".to_owned());
+        let found = S3Settings::from_url_and("s3://scenes", None, variable).unwrap().credentials;
+        match want {
+            Some(identity) => assert_eq!(found, S3Credentials::Identity(identity)),
+            None => assert!(matches!(found, S3Credentials::Key(_)), "{found:?}"),
+        }
+    }
 }
 
 /// Against a real server: `RAYHERD_S3_ENDPOINT` and `RAYHERD_S3_BUCKET`, credentials as in [`S3Settings::from_url`].
@@ -173,6 +289,25 @@ async fn conforms_on_a_real_server() {
         let settings = S3Settings::from_url(&url, Some(&endpoint)).unwrap();
         let store = S3Store::connect(settings.clone()).await.unwrap();
         conformance(&store).await;
+        // above what goes in one put, gone on with after a part of it
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("file");
+        let body: Vec<u8> = (0..70_000_001_u32).map(|i| (i >> 12) as u8 ^ i as u8).collect();
+        std::fs::write(&file, &body).unwrap();
+        let upload = store.begin("conformance/parts").await.unwrap();
+        store.send("conformance/parts", file.clone(), &upload, 1, (0, 8 << 20), None).await.unwrap();
+        assert_eq!(store.unfinished("conformance/parts").await.unwrap().as_deref(), Some(&*upload));
+        let known = store.parts_of("conformance/parts", &upload).await.unwrap();
+        assert_eq!(known.into_iter().map(|(number, (size, _))| (number, size)).collect::<Vec<_>>(), [(1, 8 << 20)]);
+        store.put_file("conformance/parts", &file).await.unwrap();
+        assert!(store.get("conformance/parts").await.unwrap() == body[..]);
+        assert_eq!(store.unfinished("conformance/parts").await.unwrap(), None);
+        store.delete(&["conformance/parts".to_owned()]).await.unwrap();
+        S3Store::new(S3Settings { bucket: "made-here".to_owned(), ..settings.clone() })
+            .unwrap()
+            .make_bucket()
+            .await
+            .unwrap();
         // MinIO on a file system cannot hold both, S3 can
         store.put("folder/object", Bytes::new()).await.unwrap();
         let clash = store.put("folder/object/below", Bytes::new()).await;
@@ -182,9 +317,9 @@ async fn conforms_on_a_real_server() {
         }
         store.delete(&["folder/object".to_owned()]).await.unwrap();
 
-        let mut wrong = settings.clone();
-        wrong.credentials.secret_key = "wrong".to_owned();
-        let error = S3Store::connect(wrong).await.unwrap_err();
+        let S3Credentials::Key(key) = settings.credentials.clone() else { panic!("no key in the environment") };
+        let wrong = S3Key { secret_key: "wrong".to_owned(), ..key };
+        let error = S3Store::connect(S3Settings { credentials: wrong.into(), ..settings.clone() }).await.unwrap_err();
         assert!(matches!(&error, StoreError::Denied { .. }), "{error:?}");
         let error = S3Store::connect(S3Settings { bucket: "no-such-bucket".to_owned(), ..settings }).await.unwrap_err();
         assert!(matches!(&error, StoreError::NoBucket { .. }), "{error:?}");
