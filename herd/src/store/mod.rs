@@ -57,6 +57,13 @@ pub trait BlockStore: Send + Sync {
     }
     /// Reads a whole object.
     async fn get(&self, key: &str) -> Result<Bytes, StoreError>;
+    /// Reads a whole object into a file, which is made or replaced; its size in bytes. Backends for which it matters do not hold it in
+    /// memory. After an error the file holds anything.
+    async fn get_file(&self, key: &str, file: &Path) -> Result<u64, StoreError> {
+        let body = self.get(key).await?;
+        tokio::fs::write(file, &body).await.map_err(|e| unwritable(self.describe(), file, &e))?;
+        Ok(body.len() as u64)
+    }
     /// Size of an object in bytes, `None` when there is none.
     async fn size(&self, key: &str) -> Result<Option<u64>, StoreError>;
     /// Keys that begin with the prefix (any string prefix, not only whole segments), ascending by bytes, with sizes.
@@ -69,6 +76,11 @@ pub trait BlockStore: Send + Sync {
 
 fn unreadable(store: String, file: &Path, e: &std::io::Error) -> StoreError {
     StoreError::Misconfigured { store, message: format!("cannot read {}, which is to be put: {e}", file.display()) }
+}
+
+fn unwritable(store: String, file: &Path, e: &std::io::Error) -> StoreError {
+    let message = format!("cannot write {}: {e}; give it room, or another folder", file.display());
+    StoreError::Misconfigured { store, message }
 }
 
 /// Why a store did not do it, named by what the caller can do.

@@ -63,6 +63,11 @@ impl BlockStore for Prefixed {
         self.inner.get(&self.path(key)).await.map_err(|e| self.own(e))
     }
 
+    async fn get_file(&self, key: &str, file: &Path) -> Result<u64, StoreError> {
+        check_key(key)?;
+        self.inner.get_file(&self.path(key), file).await.map_err(|e| self.own(e))
+    }
+
     async fn size(&self, key: &str) -> Result<Option<u64>, StoreError> {
         check_key(key)?;
         self.inner.size(&self.path(key)).await.map_err(|e| self.own(e))

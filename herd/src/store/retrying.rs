@@ -96,6 +96,10 @@ impl BlockStore for Retrying {
         self.retry(|| self.inner.get(key)).await
     }
 
+    async fn get_file(&self, key: &str, file: &Path) -> Result<u64, StoreError> {
+        self.retry(|| self.inner.get_file(key, file)).await
+    }
+
     async fn size(&self, key: &str) -> Result<Option<u64>, StoreError> {
         self.retry(|| self.inner.size(key)).await
     }

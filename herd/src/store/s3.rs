@@ -22,6 +22,7 @@ use aws_smithy_http_client::tls::Provider;
 use aws_smithy_http_client::tls::rustls_provider::CryptoMode;
 use bytes::{Bytes, BytesMut};
 use md5::{Digest, Md5};
+use tokio::io::AsyncWriteExt;
 
 use super::{BlockStore, StoreError, check_key, check_prefix};
 
@@ -243,6 +244,16 @@ impl S3Store {
         }
     }
 
+    /// The body of an object as it comes, and how long it is to be.
+    async fn stream(&self, key: &str) -> Result<(ByteStream, u64), StoreError> {
+        check_key(key)?;
+        let request = self.client.get_object().bucket(&self.bucket).key(self.path(key)).send();
+        let response = request.await.map_err(|e| self.failure("get", key, 0, e))?;
+        let announced = response.content_length().and_then(|n| u64::try_from(n).ok());
+        let length = announced.ok_or_else(|| self.broken("get", key, "the answer does not say how long it is"))?;
+        Ok((response.body, length))
+    }
+
     fn check_size(&self, key: &str, bytes: u64) -> Result<(), StoreError> {
         if bytes <= LARGEST {
             return Ok(());
@@ -314,18 +325,14 @@ impl BlockStore for S3Store {
     }
 
     async fn get(&self, key: &str) -> Result<Bytes, StoreError> {
-        check_key(key)?;
-        let request = self.client.get_object().bucket(&self.bucket).key(self.path(key)).send();
-        let mut response = request.await.map_err(|e| self.failure("get", key, 0, e))?;
-        let announced = response.content_length().and_then(|n| u64::try_from(n).ok());
-        let length = announced.ok_or_else(|| self.broken("get", key, "the answer does not say how long it is"))?;
+        let (mut stream, length) = self.stream(key).await?;
         if length > LARGEST {
             return Err(self.broken("get", key, format!("{length} bytes: nothing that large was put")));
         }
         // what a server announces is not memory yet
         let mut body = BytesMut::with_capacity(length.min(FIRST_ALLOCATION) as usize);
         loop {
-            match response.body.try_next().await {
+            match stream.try_next().await {
                 Ok(Some(part)) if (body.len() + part.len()) as u64 <= length => body.extend_from_slice(&part),
                 Ok(Some(_)) => return Err(self.broken("get", key, format!("more than {length} bytes came"))),
                 Ok(None) if body.len() as u64 == length => return Ok(body.freeze()),
@@ -333,6 +340,30 @@ impl BlockStore for S3Store {
                 Err(e) => return Err(self.broken("get", key, causes(&e))),
             }
         }
+    }
+
+    async fn get_file(&self, key: &str, file: &Path) -> Result<u64, StoreError> {
+        let (mut stream, length) = self.stream(key).await?;
+        let failed = |e: std::io::Error| super::unwritable(self.describe(), file, &e);
+        let mut out = tokio::fs::File::create(file).await.map_err(failed)?;
+        let mut came = 0;
+        loop {
+            match stream.try_next().await {
+                Ok(Some(part)) => {
+                    came += part.len() as u64;
+                    if came > length {
+                        return Err(self.broken("get", key, format!("more than {length} bytes came")));
+                    }
+                    out.write_all(&part).await.map_err(failed)?;
+                }
+                Ok(None) if came == length => break,
+                Ok(None) => return Err(self.broken("get", key, format!("{came} of {length} bytes came"))),
+                Err(e) => return Err(self.broken("get", key, causes(&e))),
+            }
+        }
+        // what is written is written when this returns
+        out.flush().await.map_err(failed)?;
+        Ok(length)
     }
 
     async fn size(&self, key: &str) -> Result<Option<u64>, StoreError> {

@@ -225,6 +225,10 @@ impl BlockStore for Watched {
         let none = || StoreError::NotFound { store: self.inner.describe(), key: key.to_owned() };
         self.ask("get", key, self.inner.get(key)).await?.ok_or_else(none)
     }
+    async fn get_file(&self, key: &str, file: &Path) -> Result<u64, StoreError> {
+        let none = || StoreError::NotFound { store: self.inner.describe(), key: key.to_owned() };
+        self.ask("get", key, self.inner.get_file(key, file)).await?.ok_or_else(none)
+    }
     async fn size(&self, key: &str) -> Result<Option<u64>, StoreError> {
         Ok(self.ask("size", key, self.inner.size(key)).await?.flatten())
     }
