@@ -196,7 +196,7 @@ fn job(arguments: &Arguments) -> anyhow::Result<RenderJob> {
     let mut job = match &arguments.file {
         Some(file) => {
             let job = read_job(file)?;
-            options::check(&job, Some(file))?;
+            options::check_local(&job, Some(file))?;
             job
         }
         None => RenderJob::new(RenderJobSpec::default()),
@@ -215,7 +215,7 @@ fn job(arguments: &Arguments) -> anyhow::Result<RenderJob> {
     set(&mut spec.sampling.time_limit, arguments.sampling.time_limit);
     set(&mut spec.image.output, arguments.output.clone());
     set(&mut spec.image.exposure, arguments.exposure);
-    options::check(&job, None)?;
+    options::check_local(&job, None)?;
     Ok(job)
 }
 
