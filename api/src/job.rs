@@ -91,7 +91,7 @@ pub struct RenderJobSpec {
     /// The machines: real ones on a cluster, virtual ones in a local run.
     #[serde(default)]
     pub workers: WorkersSpec,
-    /// Nodes that hold a copy of each block; 1 by default.
+    /// Nodes that hold a copy of each block, at most as many as the storage has servers (in a local run as there are nodes); 1 by default.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[schemars(range(min = 1, max = 16))]
     pub replicas: Option<i32>,

@@ -23,4 +23,4 @@ pub use job::{
     SceneSpec, StorageSpec, WorkersSpec,
 };
 pub use strategy::Strategy;
-pub use validate::{Problem, validate};
+pub use validate::{Problem, validate, validate_local};

@@ -149,13 +149,28 @@ fn check_workers(c: &mut Checks, job: &RenderJob) {
     c.check("spec.workers.template", workers.template.as_ref().is_none_or(serde_json::Value::is_object), || {
         "is no object: give a PodTemplateSpec, with metadata and spec".into()
     });
-    c.range("spec.replicas", job.spec.replicas.map(f64::from), 1.0, 16.0);
-    let known_nodes = workers.nodes.map_or(workers.slots.len().max(1), |n| n.max(1) as usize);
-    if let Some(replicas) = job.spec.replicas {
-        c.check("spec.replicas", replicas < 1 || replicas as usize <= known_nodes, || {
-            format!("is {replicas}, but there are {known_nodes} nodes: ask for at most one copy per node")
+    // one that is misspelt would change nothing, and nobody would say so
+    for name in workers.template.iter().filter_map(serde_json::Value::as_object).flat_map(|t| t.keys()) {
+        let known = matches!(name.as_str(), "apiVersion" | "kind" | "metadata" | "spec");
+        c.check(&format!("spec.workers.template.{name}"), known, || {
+            "is no part of a PodTemplateSpec: give metadata and spec".into()
         });
     }
+    c.range("spec.replicas", job.spec.replicas.map(f64::from), 1.0, 16.0);
+}
+
+/// What else is wrong with a job that runs in one process, whose virtual nodes are its stores as well. On a cluster these are servers, of
+/// which there may be more than workers.
+pub fn validate_local(job: &RenderJob) -> Vec<Problem> {
+    let mut c = Checks(Vec::new());
+    let workers = &job.spec.workers;
+    let nodes = workers.nodes.map_or(workers.slots.len().max(1), |n| n.max(1) as usize);
+    if let Some(replicas) = job.spec.replicas {
+        c.check("spec.replicas", replicas < 1 || replicas as usize <= nodes, || {
+            format!("is {replicas}, but there are {nodes} nodes: ask for at most one copy per node")
+        });
+    }
+    c.0
 }
 
 struct Checks(Vec<Problem>);
@@ -284,7 +299,8 @@ spec:
         spec.overlap_threshold = Some(1.1);
         spec.workers.nodes = Some(3);
         spec.workers.memory = Some(ByteSize::new(0));
-        spec.replicas = Some(4);
+        spec.workers.template = Some(serde_json::json!({"spce": {}, "spec": {}}));
+        spec.replicas = Some(17);
         spec.task_seconds = Some(0.0);
         spec.active_deadline_seconds = Some(0);
         spec.ttl_seconds_after_finished = Some(-1);
@@ -317,12 +333,23 @@ spec:
             "spec.overlapThreshold",
             "spec.workers.slots",
             "spec.workers.memory",
+            "spec.workers.template.spce",
             "spec.replicas",
             "spec.taskSeconds",
             "spec.activeDeadlineSeconds",
             "spec.ttlSecondsAfterFinished",
         ];
         assert_eq!(fields, want);
+    }
+
+    #[test]
+    fn a_cluster_may_have_more_servers_than_a_job_has_workers() {
+        let mut job = parse(FULL).unwrap();
+        job.spec.workers = crate::WorkersSpec { nodes: Some(1), ..Default::default() };
+        assert_eq!(validate(&job), []);
+        assert_eq!(validate_local(&job)[0].field, "spec.replicas");
+        job.spec.replicas = Some(1);
+        assert_eq!(validate_local(&job), []);
     }
 
     /// Kubernetes' structural schemas have int32, int64 and no unsigned formats.

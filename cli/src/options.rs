@@ -86,7 +86,17 @@ pub fn set<T: Clone>(field: &mut Option<T>, flag: Option<T>) {
 
 /// Every problem of a job as one error, told by field when it came from a file and by flag otherwise.
 pub fn check(job: &RenderJob, file: Option<&Path>) -> Result<(), Mistake> {
-    let problems = rayherd_api::validate(job);
+    told(&rayherd_api::validate(job), file)
+}
+
+/// The same of a job that runs in this process.
+pub fn check_local(job: &RenderJob, file: Option<&Path>) -> Result<(), Mistake> {
+    let mut problems = rayherd_api::validate(job);
+    problems.extend(rayherd_api::validate_local(job));
+    told(&problems, file)
+}
+
+fn told(problems: &[rayherd_api::Problem], file: Option<&Path>) -> Result<(), Mistake> {
     if problems.is_empty() {
         return Ok(());
     }

@@ -16,6 +16,13 @@ use crate::storage::secret_name;
 pub const LABEL: &str = "rayherd.io/job";
 /// The number of a worker in its job.
 pub const NUMBER: &str = "rayherd.io/worker";
+/// The container of a pod that is a worker.
+pub const CONTAINER: &str = "worker";
+/// Bytes of the scene that a worker would find on another node, for which it is moved there: what it reads, maybe more than once, while
+/// another pod starts.
+const MOVED_FOR: u64 = 8 << 20;
+/// Whether it was known where the scene lies when a pod was made.
+const PLACED: &str = "rayherd.io/placed";
 /// Whom the workers' tokens are for.
 pub const AUDIENCE: &str = "rayherd";
 /// Scene data that a worker holds when the job says nothing.
@@ -99,7 +106,7 @@ pub fn pod(
                 "seccompProfile": {"type": "RuntimeDefault"},
             },
             "containers": [{
-                "name": "worker",
+                "name": CONTAINER,
                 "image": config.image,
                 "resources": {"requests": resources, "limits": resources},
                 "securityContext": {
@@ -125,6 +132,9 @@ pub fn pod(
         true => json!([]),
         false => json!([{"secretRef": {"name": secret_name(&job.spec.storage)}}]),
     };
+    if job.spec.placement == Placement::Required {
+        bind(&mut pod, &holders(held));
+    }
     let ours = json!({
         "apiVersion": "v1",
         "kind": "Pod",
@@ -134,6 +144,7 @@ pub fn pod(
             "labels": {
                 LABEL: uid,
                 NUMBER: number.to_string(),
+                PLACED: (!held.is_empty()).to_string(),
                 "app.kubernetes.io/name": "rayherd-worker",
                 "app.kubernetes.io/managed-by": "rayherd-operator",
             },
@@ -142,7 +153,7 @@ pub fn pod(
             "automountServiceAccountToken": false,
             "restartPolicy": "OnFailure",
             "containers": [{
-                "name": "worker",
+                "name": CONTAINER,
                 "env": env,
                 "envFrom": keys,
                 "volumeMounts": [{"name": "token", "mountPath": "/var/run/secrets/rayherd", "readOnly": true}],
@@ -165,12 +176,21 @@ pub fn pod(
 }
 
 /// Puts one object on top of another. Lists are joined: an item of a name (or mount path) that is there is merged into that one, others
-/// are added. Lists of plain values (a command) are replaced.
+/// are added; a volume or a variable takes the place of that of its name, as half of each is neither. Lists of plain values (a command)
+/// are replaced. What is null is not given.
 fn merge(base: &mut Value, top: &Value) {
     match (base, top) {
+        (_, Value::Null) => {}
         (Value::Object(base), Value::Object(top)) => {
             for (name, value) in top {
                 match base.get_mut(name) {
+                    Some(Value::Array(known)) if matches!(name.as_str(), "volumes" | "env") && value.is_array() => {
+                        let items = value.as_array().into_iter().flatten();
+                        for item in items {
+                            known.retain(|k| k.get("name").is_none() || k.get("name") != item.get("name"));
+                            known.push(item.clone());
+                        }
+                    }
                     Some(known) => merge(known, value),
                     None => drop(base.insert(name.clone(), value.clone())),
                 }
@@ -215,13 +235,62 @@ fn affinity(uid: &str, held: &BTreeMap<String, u64>, placement: Placement) -> Va
         return affinity;
     }
     affinity["nodeAffinity"] = json!({"preferredDuringSchedulingIgnoredDuringExecution": terms});
-    if placement == Placement::Required {
-        let nodes: Vec<&String> = held.iter().filter(|(_, bytes)| **bytes > 0).map(|(node, _)| node).collect();
-        let expression = json!({"key": "kubernetes.io/hostname", "operator": "In", "values": nodes});
-        affinity["nodeAffinity"]["requiredDuringSchedulingIgnoredDuringExecution"] =
-            json!({"nodeSelectorTerms": [{"matchExpressions": [expression]}]});
-    }
     affinity
+}
+
+/// Nodes that hold some of the scene.
+fn holders(held: &BTreeMap<String, u64>) -> Vec<&String> {
+    held.iter().filter(|(_, bytes)| **bytes > 0).map(|(node, _)| node).collect()
+}
+
+/// Binds a pod to nodes, whatever else its template requires: of a template's terms one must hold, so each gets ours beside its own.
+fn bind(pod: &mut Value, nodes: &[&String]) {
+    // there is one where data lies; what a template puts there that is no object the API server refuses
+    let Some(Value::Object(affinity)) = pod.pointer_mut("/spec/affinity/nodeAffinity") else { return };
+    if nodes.is_empty() {
+        return;
+    }
+    let ours = json!({"key": "kubernetes.io/hostname", "operator": "In", "values": nodes});
+    let required = affinity.entry("requiredDuringSchedulingIgnoredDuringExecution").or_insert_with(|| json!({}));
+    let Value::Object(required) = required else { return };
+    let terms = required.entry("nodeSelectorTerms").or_insert_with(|| json!([]));
+    match terms {
+        Value::Array(terms) if !terms.is_empty() => {
+            let of_term =
+                |term: &Value, key: &str| term.get(key).and_then(Value::as_array).is_some_and(|l| !l.is_empty());
+            // an empty term holds nowhere, and must not begin to
+            for term in terms.iter_mut().filter(|t| of_term(t, "matchExpressions") || of_term(t, "matchFields")) {
+                let Value::Object(term) = term else { continue };
+                if let Value::Array(all) = term.entry("matchExpressions").or_insert_with(|| json!([])) {
+                    all.push(ours.clone());
+                }
+            }
+        }
+        Value::Array(terms) => terms.push(json!({"matchExpressions": [ours]})),
+        _ => {}
+    }
+}
+
+/// Whether a pod that was made before it was known where the scene lies is better made anew: `Required` allows no other nodes than those
+/// that hold some of it, and a worker is to be on one of the nodes that hold most, where the others hold much less.
+fn is_misplaced(pod: &Pod, held: &BTreeMap<String, u64>, placement: Placement, wanted: u32) -> bool {
+    let label = pod.metadata.labels.as_ref().and_then(|l| l.get(PLACED));
+    if label.is_none_or(|l| l != "false") || holders(held).is_empty() {
+        return false;
+    }
+    let node = pod.spec.as_ref().and_then(|s| s.node_name.as_ref());
+    let here = node.and_then(|n| held.get(n)).copied().unwrap_or(0);
+    match placement {
+        Placement::None => false,
+        Placement::Required => here == 0,
+        // what moving a worker takes is worth many small reads
+        Placement::Preferred => {
+            let mut most: Vec<u64> = held.values().copied().collect();
+            most.sort_unstable_by(|a, b| b.cmp(a));
+            let good = most.get((wanted as usize).clamp(1, most.len()) - 1).copied().unwrap_or(0);
+            good.saturating_sub(here) >= MOVED_FOR
+        }
+    }
 }
 
 /// What to do about the pods of a job.
@@ -233,11 +302,12 @@ pub struct Plan {
     pub delete: Vec<String>,
 }
 
-/// Compares the pods that there are with those that there should be: one that lives for each of the workers `0..wanted`.
+/// Compares the pods that there are with those that there should be: one that lives for each of the workers `0..wanted`, where the scene's
+/// bytes lie on nodes as in `held` (nowhere as long as that is not known).
 ///
 /// A pod that is being deleted is no worker any more; on a node that is gone it may stay for long, so the next one has
 /// another name.
-pub fn plan(job: &str, pods: &[Pod], wanted: u32) -> Plan {
+pub fn plan(job: &str, pods: &[Pod], wanted: u32, (held, placement): (&BTreeMap<String, u64>, Placement)) -> Plan {
     let mut plan = Plan::default();
     let mut living = vec![false; wanted as usize];
     for pod in pods {
@@ -248,7 +318,13 @@ pub fn plan(job: &str, pods: &[Pod], wanted: u32) -> Plan {
             continue;
         }
         match number.and_then(|n| living.get_mut(n as usize)) {
-            Some(alive) if !*alive && !matches!(phase, "Failed" | "Succeeded") => *alive = true,
+            Some(alive)
+                if !*alive
+                    && !matches!(phase, "Failed" | "Succeeded")
+                    && !is_misplaced(pod, held, placement, wanted) =>
+            {
+                *alive = true;
+            }
             _ => plan.delete.push(name),
         }
     }
@@ -387,6 +463,24 @@ mod tests {
         with.spec.placement = Placement::Required;
         let path = "/spec/affinity/nodeAffinity/requiredDuringSchedulingIgnoredDuringExecution/nodeSelectorTerms/0/matchExpressions/0/values";
         assert_eq!(made(&with).pointer(path), Some(&json!(["node1"])));
+        // each of the terms of which one must hold, but for one that holds nowhere
+        let affinity = &mut with.spec.workers.template.as_mut().unwrap()["spec"]["affinity"]["nodeAffinity"];
+        affinity["requiredDuringSchedulingIgnoredDuringExecution"] = json!({"nodeSelectorTerms": [
+            {"matchExpressions": [{"key": "disk", "operator": "Exists"}]},
+            {"matchFields": [{"key": "metadata.name", "operator": "In", "values": ["node7"]}]},
+            {},
+        ]});
+        let terms = path.strip_suffix("/0/matchExpressions/0/values").unwrap();
+        let ours = json!({"key": "kubernetes.io/hostname", "operator": "In", "values": ["node1"]});
+        let both = made(&with);
+        let at = |rest: &str| both.pointer(&format!("{terms}{rest}"));
+        assert_eq!((at("/0/matchExpressions/1"), at("/1/matchExpressions/0")), (Some(&ours), Some(&ours)));
+        assert_eq!((at("/0/matchExpressions/0/key"), at("/2")), (Some(&json!("disk")), Some(&json!({}))));
+        // what is null is not given, and what is no object is left to the API server
+        for (wanted, bound) in [(json!(null), Some(json!(["node1"]))), (json!("x"), None)] {
+            with.spec.workers.template = Some(json!({"spec": {"affinity": wanted}}));
+            assert_eq!(made(&with).pointer(path).cloned(), bound);
+        }
         let mut without = job();
         without.spec.placement = Placement::None;
         assert_eq!(made(&without).pointer("/spec/affinity/nodeAffinity"), None);
@@ -403,6 +497,62 @@ mod tests {
         let account = Some("renderer".to_owned());
         let known = Storage { identity: true, service_account: account.clone(), ..Storage::default() };
         assert_eq!(made(&known), (account, 0));
+    }
+
+    #[test]
+    fn a_volume_or_a_variable_of_a_template_takes_the_place_of_ours_and_ours_of_what_makes_a_worker() {
+        let storage = Storage { bucket: "b".into(), region: "r".into(), ..Storage::default() };
+        let mut with = job();
+        with.spec.workers.template = Some(json!({"spec": {
+            "volumes": [{"name": "scratch", "hostPath": {"path": "/fast"}}, {"name": "token", "emptyDir": {}}],
+            "containers": [{"name": "worker", "env": [
+                {"name": "RAYHERD_JOB", "valueFrom": {"fieldRef": {"fieldPath": "metadata.name"}}},
+                {"name": "MINE", "value": "1"},
+            ]}],
+        }}));
+        let made = pod(&with, &config(), &storage, &BTreeMap::new(), "PEM", 0, "box-w0").unwrap();
+        let of = |list: &str, name: &str| {
+            let all = made.pointer(list).unwrap().as_array().unwrap().iter();
+            all.filter(|v| v["name"] == name).cloned().collect::<Vec<_>>()
+        };
+        assert_eq!(of("/spec/volumes", "scratch"), [json!({"name": "scratch", "hostPath": {"path": "/fast"}})]);
+        let [token] = &of("/spec/volumes", "token")[..] else { panic!("one token") };
+        assert!(token.get("emptyDir").is_none() && token.get("projected").is_some());
+        let env = "/spec/containers/0/env";
+        assert_eq!(of(env, "RAYHERD_JOB"), [json!({"name": "RAYHERD_JOB", "value": "u-1"})]);
+        assert_eq!(of(env, "MINE").len(), 1);
+    }
+
+    #[test]
+    fn a_worker_that_came_before_the_scene_goes_to_it() {
+        let pod = |node: Option<&str>, placed: &str| -> Pod {
+            let labels = json!({NUMBER: "0", PLACED: placed});
+            let pod =
+                json!({"metadata": {"name": "a-w0", "labels": labels}, "spec": {"nodeName": node, "containers": []}});
+            serde_json::from_value(pod).unwrap()
+        };
+        let held: BTreeMap<String, u64> =
+            [("a", 50), ("b", 50), ("c", 41), ("d", 0)].map(|(n, b)| (n.into(), b << 20)).into();
+        let goes = |pod: Pod, placement, wanted| !plan("a", &[pod], wanted, (&held, placement)).delete.is_empty();
+        for (node, placement, wanted, away) in [
+            (Some("a"), Placement::Required, 2, false),
+            (Some("c"), Placement::Required, 2, false),
+            (Some("d"), Placement::Required, 2, true),
+            (Some("elsewhere"), Placement::Required, 2, true),
+            (None, Placement::Required, 2, true),
+            (Some("a"), Placement::Preferred, 2, false),
+            (Some("c"), Placement::Preferred, 2, true),
+            (Some("c"), Placement::Preferred, 3, false),
+            (Some("elsewhere"), Placement::Preferred, 9, false),
+            (Some("elsewhere"), Placement::Preferred, 3, true),
+            (Some("elsewhere"), Placement::None, 2, false),
+            (None, Placement::Preferred, 2, true),
+        ] {
+            assert_eq!(goes(pod(node, "false"), placement, wanted), away, "{node:?} {placement:?} {wanted}");
+            assert!(!goes(pod(node, "true"), placement, wanted), "it was made with all that is known");
+        }
+        // before that is known nobody goes
+        assert_eq!(plan("a", &[pod(None, "false")], 1, (&BTreeMap::new(), Placement::Required)), Plan::default());
     }
 
     #[test]
@@ -428,6 +578,8 @@ mod tests {
             }
             serde_json::from_value(pod).unwrap()
         };
+        let (none, anywhere) = (BTreeMap::new(), Placement::Preferred);
+        let plan = |job: &str, pods: &[Pod], wanted| plan(job, pods, wanted, (&none, anywhere));
         let names = |plan: &Plan| plan.make.iter().map(|(_, n)| n.clone()).collect::<Vec<_>>();
         assert_eq!(names(&plan("a", &[], 2)), ["a-w0", "a-w1"]);
         let there = [pod("a-w0", "0", "Running", false), pod("a-w1", "1", "Pending", false)];

@@ -1,13 +1,16 @@
 //! The jobs that this operator runs, each on a thread of its own.
 
-use std::collections::BTreeMap;
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::collections::{BTreeMap, BTreeSet};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError, RwLock};
 
 use k8s_openapi::jiff::Timestamp;
 use rayherd_api::RenderJobSpec;
 use rayherd_herd::job::Status;
 use rayherd_herd::remote::{Fleet, Storage};
 use rayherd_herd::report::Report;
+
+use crate::backoff::Rests;
+use crate::storage::is_local;
 
 /// A job that runs, or has run.
 pub struct Running {
@@ -17,8 +20,8 @@ pub struct Running {
     pub spec: RenderJobSpec,
     /// Its workers.
     pub fleet: Fleet,
-    /// Its storage, as it was when the job began.
-    pub storage: Storage,
+    /// Its storage, with the nodes that its servers were on when they were last looked for.
+    pub storage: RwLock<Storage>,
     /// How far it is.
     pub state: Mutex<State>,
 }
@@ -48,6 +51,13 @@ pub struct State {
     pub pictures: Vec<String>,
     /// How it ended, and when.
     pub end: Option<(Timestamp, Result<(), Problem>)>,
+    /// Containers that were killed for lack of memory, as far as that was told; none before the pods were looked at first, when those
+    /// of an earlier run are noted.
+    pub killed: Option<BTreeSet<String>>,
+    /// Workers whose pods failed or were refused.
+    pub rests: Rests,
+    /// Why the API server takes no more pods, if that is so.
+    pub refused: Option<String>,
     /// Pods whose tokens count, by uid, with the worker that each is.
     pub pods: BTreeMap<String, u32>,
 }
@@ -65,6 +75,14 @@ impl Running {
     /// How far it is.
     pub fn lock(&self) -> MutexGuard<'_, State> {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+    /// Its storage.
+    pub fn storage(&self) -> Storage {
+        self.storage.read().unwrap_or_else(PoisonError::into_inner).clone()
+    }
+    /// Whether the storage has servers on nodes; one that is away just now is on none.
+    pub fn is_local(&self) -> bool {
+        is_local(&self.storage())
     }
     /// Whether its thread has ended.
     pub fn is_over(&self) -> bool {

@@ -1,11 +1,13 @@
 //! The operator: watches RenderJobs, runs their workers, plans and commits their rounds.
 
 mod authority;
+mod backoff;
 mod buckets;
 mod build;
 mod config;
 mod finish;
 mod jobs;
+mod kills;
 mod lease;
 mod ledger;
 mod metrics;
@@ -18,14 +20,16 @@ mod tasks;
 mod tests;
 mod tls;
 mod trial;
+mod watching;
 
 use std::process::ExitCode;
 use std::sync::Arc;
+use std::time::Instant;
 
 use futures::StreamExt;
 use k8s_openapi::api::core::v1::Pod;
 use kube::api::{Patch, PatchParams};
-use kube::runtime::controller::Controller;
+use kube::runtime::controller::{self, Controller};
 use kube::runtime::watcher;
 use kube::{Api, Client};
 use rayherd_api::resource::definition;
@@ -38,6 +42,9 @@ use reconcile::Context;
 
 /// The API server ends a watch after this many seconds; below what load balancers and proxies cut silently.
 const WATCH_SECONDS: u32 = 200;
+
+/// Jobs that are looked at at a time; each look takes some requests, one after the other.
+const CONCURRENCY: u16 = 16;
 
 /// Marks the operator's pod that leads.
 const LEADER: &str = "rayherd.io/leader";
@@ -108,12 +115,18 @@ async fn run() -> anyhow::Result<()> {
     let pods: Api<Pod> = context.everywhere();
     let controller = Controller::new(jobs, watch())
         .owns(pods, watch().labels(build::LABEL))
+        .with_config(controller::Config::default().concurrency(CONCURRENCY))
         .graceful_shutdown_on(terminated())
         .run(reconcile::reconcile, reconcile::failed, context.clone())
-        .for_each(|done| async move {
+        .for_each(|done| {
             if let Err(e) = done {
                 tracing::warn!("{e}");
+                if let controller::Error::QueueError(e) = &e {
+                    context.metrics.watch_errors.inc();
+                    context.watching.failed(e, Instant::now());
+                }
             }
+            futures::future::ready(())
         });
     tokio::select! {
         () = controller => {}

@@ -1,9 +1,11 @@
 //! What the operator tells Prometheus.
 
 use std::sync::Arc;
+use std::time::Instant;
 
 use axum::Router;
 use axum::extract::State;
+use axum::http::StatusCode;
 use axum::routing::get;
 use prometheus::{
     Encoder, GaugeVec, Histogram, HistogramOpts, IntCounter, IntCounterVec, IntGauge, Opts, Registry, TextEncoder,
@@ -18,6 +20,8 @@ pub struct Metrics {
     registry: Registry,
     /// Steps that failed.
     pub errors: IntCounter,
+    /// Watches that failed.
+    pub watch_errors: IntCounter,
     /// Jobs that were begun, or gone on with.
     pub started: IntCounter,
     /// Reports that nobody waits for (any more).
@@ -98,6 +102,7 @@ impl Metrics {
         }
         Ok(Metrics {
             errors: counter("rayherd_reconcile_errors_total", "reconcile steps that failed")?,
+            watch_errors: counter("rayherd_watch_errors_total", "watches of the API server that failed")?,
             started: counter("rayherd_jobs_started_total", "jobs that were begun or gone on with")?,
             ignored: counter("rayherd_worker_reports_ignored_total", "reports of work that nobody waits for")?,
             refused,
@@ -131,7 +136,8 @@ impl Metrics {
         let scene = |k: Kind| matches!(k, Kind::Geometry | Kind::Attributes | Kind::Texture);
         let read = |place: Place| tally.bytes.sum(|_, o, k, p| o == Op::Read && p == place && scene(k));
         let (near, far) = (read(Place::Local), read(Place::Remote));
-        if near + far > 0 {
+        // where no server is on a node all are far, and that is no fault
+        if running.is_local() && near + far > 0 {
             self.remote.with_label_values(&labels).set(far as f64 / (near + far) as f64);
         }
         for row in tally.bytes.rows() {
@@ -149,8 +155,10 @@ impl Metrics {
         self.rounds.with_label_values(&labels).set(state.status.rounds as f64);
         self.tasks.with_label_values(&labels).set(state.reports.iter().map(|r| r.tasks).sum::<u64>() as f64);
         self.waiting.with_label_values(&labels).set(state.status.waiting as f64);
-        self.workers.with_label_values(&labels).set(f64::from(tally.ready));
-        let slots = running.spec.workers.slots_per_node(1).unwrap_or_default();
+        // workers that are kept warm have nothing to do, and should have
+        let over = state.end.is_some();
+        self.workers.with_label_values(&labels).set(if over { 0.0 } else { f64::from(tally.ready) });
+        let slots = running.spec.workers.slots_per_node(1).filter(|_| !over).unwrap_or_default();
         self.wanted.with_label_values(&labels).set(slots.len() as f64);
         self.slots.with_label_values(&labels).set(slots.iter().map(|&s| f64::from(s)).sum());
         let (made, of) = (state.status.samples, state.status.samples_total.max(1));
@@ -210,11 +218,18 @@ impl Metrics {
     }
 }
 
+async fn health(State(context): State<Arc<Context>>) -> (StatusCode, &'static str) {
+    if context.watching.is_dead(Instant::now()) {
+        return (StatusCode::SERVICE_UNAVAILABLE, "the API server cannot be watched");
+    }
+    (StatusCode::OK, "ok")
+}
+
 /// Serves `/metrics`, and `/healthz` for the kubelet.
 pub async fn serve(context: Arc<Context>) -> anyhow::Result<()> {
     let listener = tokio::net::TcpListener::bind(context.config.metrics).await?;
     let metrics = |State(context): State<Arc<Context>>| async move { context.metrics.text().unwrap_or_default() };
-    let router = Router::new().route("/metrics", get(metrics)).route("/healthz", get(|| async { "ok" }));
+    let router = Router::new().route("/metrics", get(metrics)).route("/healthz", get(health));
     Ok(axum::serve(listener, router.with_state(context)).await?)
 }
 
@@ -270,16 +285,52 @@ mod tests {
     }
 
     #[test]
+    fn workers_of_a_job_that_is_over_are_wanted_no_more() {
+        let metrics = Metrics::new().unwrap();
+        let storage = rayherd_herd::remote::Storage { bucket: "b".into(), region: "r".into(), ..Default::default() };
+        let running = Running {
+            generation: 1,
+            spec: rayherd_api::RenderJobSpec::default(),
+            fleet: rayherd_herd::remote::Fleet::new(1, "e"),
+            storage: storage.into(),
+            state: Default::default(),
+        };
+        let wanted = || metrics.wanted.with_label_values(&["n", "a"]).get();
+        metrics.observe("n", "a", &running);
+        assert_eq!(wanted(), 1.0);
+        running.lock().end = Some((k8s_openapi::jiff::Timestamp::UNIX_EPOCH, Ok(())));
+        metrics.observe("n", "a", &running);
+        assert_eq!((wanted(), metrics.slots.with_label_values(&["n", "a"]).get()), (0.0, 0.0));
+    }
+
+    #[test]
     fn names_are_unique_and_ended_jobs_leave_no_labels() {
         let metrics = Metrics::new().unwrap();
         for job in ["a", "b"] {
-            metrics.cpu.with_label_values(&["n", job]).set(1.5);
+            for gauge in [
+                &metrics.cpu,
+                &metrics.remote,
+                &metrics.rounds,
+                &metrics.tasks,
+                &metrics.waiting,
+                &metrics.workers,
+                &metrics.wanted,
+                &metrics.slots,
+                &metrics.progress,
+                &metrics.degraded,
+                &metrics.error,
+            ] {
+                gauge.with_label_values(&["n", job]).set(1.5);
+            }
             metrics.bytes.with_label_values(&["n", job, "trace", "read", "geometry", "local"]).set(7.0);
         }
-        assert_eq!(metrics.text().unwrap().matches("job=\"a\"").count(), 2);
+        // no family of jobs is left out
+        let text = metrics.text().unwrap();
+        let families = text.lines().filter(|l| l.starts_with("# TYPE rayherd_job_")).count();
+        assert_eq!((text.matches("job=\"a\"").count(), families), (12, 12), "{text}");
         metrics.forget("n", "a");
         let text = metrics.text().unwrap();
-        assert_eq!((text.matches("job=\"a\"").count(), text.matches("job=\"b\"").count()), (0, 2), "{text}");
+        assert_eq!((text.matches("job=\"a\"").count(), text.matches("job=\"b\"").count()), (0, 12), "{text}");
         assert!(text.contains("rayherd_reconcile_errors_total 0"));
     }
 }

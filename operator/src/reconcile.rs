@@ -1,6 +1,6 @@
 //! One step towards what a RenderJob asks for: look, decide, apply, tell.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::{Arc, PoisonError, RwLock};
 use std::time::{Duration, Instant};
 
@@ -22,14 +22,17 @@ use rayherd_herd::remote::{Storage, Turns};
 use rayherd_herd::store::StoreError;
 use serde_json::json;
 
+use crate::backoff::Failures;
 use crate::build;
 use crate::config::Config;
 use crate::finish::{self, Leftovers};
-use crate::jobs::{Jobs, Running};
+use crate::jobs::{Jobs, Running, State};
+use crate::kills::{Kill, kills};
 use crate::metrics::Metrics;
 use crate::run;
 use crate::status;
 use crate::storage::{self, StorageError};
+use crate::watching::Watching;
 
 /// Field manager of everything but the ledger's pointers.
 const MANAGER: &str = "rayherd-operator";
@@ -43,6 +46,12 @@ const SOON: Duration = Duration::from_millis(200);
 const LOOK_UP: SignedDuration = SignedDuration::from_secs(5);
 /// A pod that is to end is taken for ended so long after its grace period, when its node does not say: it may be gone for good.
 const SILENT: SignedDuration = SignedDuration::from_secs(30);
+/// After the first failure of a job, before it is looked at again.
+const FAILED: Duration = Duration::from_secs(3);
+/// After the first pod of a worker that failed, or was refused, before another is made.
+const NO_POD: Duration = Duration::from_secs(1);
+/// A worker whose pod runs for so long is well.
+const WELL: SignedDuration = SignedDuration::from_secs(300);
 /// Before a job whose surroundings are not there (yet) is looked at again.
 const AGAIN: Duration = Duration::from_secs(10);
 
@@ -60,6 +69,10 @@ pub struct Context {
     pub turns: Arc<Turns>,
     /// What is left of deleted jobs in storages whose servers were away.
     pub left: Arc<Leftovers>,
+    /// Steps that failed in a row, by job.
+    pub failures: Failures,
+    /// Whether what happens is still seen.
+    pub watching: Watching,
     /// What a person would want to know.
     pub events: Recorder,
     /// Counts.
@@ -75,7 +88,8 @@ impl Context {
         let (jobs, trusted, turns, left) = (Jobs::default(), RwLock::default(), Arc::default(), Arc::default());
         let reporter = Reporter { controller: "rayherd-operator".into(), instance: Some(config.pod.clone()) };
         let events = Recorder::new(client.clone(), reporter);
-        Ok(Context { client, config, jobs, trusted, turns, left, events, metrics: Metrics::new()? })
+        let (failures, watching, metrics) = (Failures::default(), Watching::default(), Metrics::new()?);
+        Ok(Context { client, config, jobs, trusted, turns, left, failures, watching, events, metrics })
     }
     /// Objects of every namespace that is watched.
     pub fn everywhere<K>(&self) -> Api<K>
@@ -110,6 +124,9 @@ pub enum Error {
     /// The API server does not take the workers' pods as the job wants them.
     #[error("{0}")]
     Template(String),
+    /// The API server takes no pod of the job just now.
+    #[error("{0}")]
+    Refused(String),
     /// The storage does not do it.
     #[error("cannot clean the storage: {0}")]
     Clean(String),
@@ -126,8 +143,7 @@ fn api(action: &'static str) -> impl Fn(kube::Error) -> Error {
 pub fn failed(job: Arc<Seen>, error: &Error, context: Arc<Context>) -> Action {
     context.metrics.errors.inc();
     tracing::warn!(job = %job.name_any(), "{error}");
-    let spread = u64::from(job.meta().uid.as_deref().unwrap_or_default().bytes().fold(0u8, u8::wrapping_add));
-    Action::requeue(Duration::from_millis(3000 + 10 * spread))
+    Action::requeue(context.failures.failed(job.meta().uid.as_deref().unwrap_or_default(), FAILED))
 }
 
 /// One step.
@@ -141,6 +157,9 @@ pub async fn reconcile(job: Arc<Seen>, context: Arc<Context>) -> Result<Action, 
         Err(invalid) => unreadable(invalid, &context).await,
     };
     context.metrics.reconcile_seconds.observe(since.elapsed().as_secs_f64());
+    if result.is_ok() {
+        context.failures.succeeded(job.meta().uid.as_deref().unwrap_or_default());
+    }
     result
 }
 
@@ -247,6 +266,11 @@ async fn begin(
     match start(job, context, namespace, uid, before).await {
         Err(Error::Storage(e @ StorageError::Missing(_))) => {
             let refused = status::refused(job, "StorageMissing", &e.to_string(), false, Timestamp::now());
+            tell(job, context, jobs, refused).await?;
+            Ok(Err(Action::requeue(AGAIN)))
+        }
+        Err(Error::Refused(message)) => {
+            let refused = status::refused(job, status::PODS_REFUSED, &message, false, Timestamp::now());
             tell(job, context, jobs, refused).await?;
             Ok(Err(Action::requeue(AGAIN)))
         }
@@ -372,6 +396,10 @@ async fn keep_pods(
 ) -> Result<(), Error> {
     let pods: Api<Pod> = Api::namespaced(context.client.clone(), namespace);
     let found = list_pods(&pods, uid).await?;
+    let killed = newly_killed(&mut running.lock(), kills(&found));
+    for kill in killed {
+        running.fleet.killed_for_memory(kill.number, kill.limit.as_deref());
+    }
     let (held, prepared, waits) = {
         let state = running.lock();
         // a known scene is looked up at once: workers of an earlier run must not go for that moment
@@ -380,7 +408,28 @@ async fn keep_pods(
     };
     // until it is known where the scene's blocks are, one worker prepares it
     let wanted = if prepared { build::slots(job).len() as u32 } else { 1 };
-    let plan = if waits && !prepared { build::Plan::default() } else { build::plan(&job.name_any(), &found, wanted) };
+    let mut plan = if waits && !prepared {
+        build::Plan::default()
+    } else {
+        build::plan(&job.name_any(), &found, wanted, (&held, job.spec.placement))
+    };
+    {
+        let (mut state, now) = (running.lock(), Timestamp::now());
+        for pod in found.iter().filter(|p| p.metadata.deletion_timestamp.is_none()) {
+            let (Some(number), Some(status)) = (build::number(pod), &pod.status) else { continue };
+            let long = || status.start_time.as_ref().is_some_and(|Time(t)| now.duration_since(*t) > WELL);
+            match status.phase.as_deref() {
+                Some("Failed") => state.rests.failed(number, uid, NO_POD, now),
+                Some("Running") if long() => state.rests.well(number),
+                _ => {}
+            }
+        }
+        if plan.make.is_empty() {
+            state.refused = None;
+        }
+        // pods that fail one after the other are not made without rest
+        plan.make.retain(|(number, _)| state.rests.may(*number, now));
+    }
     {
         let living = found.iter().filter(|p| p.metadata.deletion_timestamp.is_none());
         let by_uid = living.filter_map(|p| Some((p.metadata.uid.clone()?, build::number(p)?)));
@@ -391,16 +440,62 @@ async fn keep_pods(
     }
     let trusted = context.trusted.read().unwrap_or_else(PoisonError::into_inner).clone();
     let given = pods_as_given(context, namespace);
+    if !plan.make.is_empty() {
+        // those that are known serve as well
+        if let Err(e) = find_servers(context, job, running).await {
+            tracing::warn!(job = %job.name_any(), "{e}");
+        }
+    }
+    let storage = running.storage();
     for (number, name) in &plan.make {
-        let pod = build::pod(job, &context.config, &running.storage, &held, &trusted, *number, name)
+        let pod = build::pod(job, &context.config, &storage, &held, &trusted, *number, name)
             .map_err(|e| Error::Internal(e.to_string()))?;
         let params = PatchParams::apply(MANAGER);
-        let made = given.patch(name, &params, &Patch::Apply(&pod)).await.map_err(api("make a worker's pod"))?;
-        if let Some(uid) = made.metadata.uid {
-            running.lock().pods.insert(uid, *number);
+        match given.patch(name, &params, &Patch::Apply(&pod)).await {
+            Ok(made) => {
+                let mut state = running.lock();
+                state.refused = None;
+                state.pods.extend(made.metadata.uid.map(|uid| (uid, *number)));
+            }
+            // a quota that is used up, a namespace's rules: whoever may change them is told, and it is tried again
+            Err(kube::Error::Api(e)) if matches!(e.code, 400 | 403 | 422) => {
+                context.metrics.errors.inc();
+                let mut state = running.lock();
+                state.rests.failed(*number, uid, NO_POD, Timestamp::now());
+                state.refused = Some(format!("the API server does not take the pod of worker {number}: {}", e.message));
+            }
+            Err(e) => return Err(api("make a worker's pod")(e)),
         }
     }
     Ok(())
+}
+
+/// Looks again where servers are that were away when the job began: a worker beside one is to know it.
+async fn find_servers(context: &Context, job: &RenderJobObject, running: &Running) -> Result<(), Error> {
+    let known = running.storage();
+    if !running.is_local() || known.endpoints.iter().all(|e| e.node.is_some()) {
+        return Ok(());
+    }
+    let mut found = storage::storage(&context.client, &context.config.namespace, &job.spec.storage).await?;
+    if found.endpoints.len() != known.endpoints.len() {
+        // another profile: it is for jobs that begin from now on
+        return Ok(());
+    }
+    for (now, before) in found.endpoints.iter_mut().zip(&known.endpoints) {
+        if now.url != before.url {
+            return Ok(());
+        }
+        now.node = now.node.take().or_else(|| before.node.clone());
+    }
+    *running.storage.write().unwrap_or_else(PoisonError::into_inner) = Storage { endpoints: found.endpoints, ..known };
+    Ok(())
+}
+
+/// Those of some kills that were not seen before.
+fn newly_killed(state: &mut State, kills: Vec<Kill>) -> Vec<Kill> {
+    let seen: BTreeSet<String> = kills.iter().map(|k| k.id.clone()).collect();
+    let Some(known) = state.killed.replace(seen) else { return Vec::new() };
+    kills.into_iter().filter(|k| !known.contains(&k.id)).collect()
 }
 
 /// Pods as JSON: what a job's template says of them goes to the API server as it is, which knows what is right.
@@ -417,6 +512,10 @@ async fn try_pod(job: &RenderJobObject, context: &Context, namespace: &str, stor
     let params = PatchParams { field_validation: Some(ValidationDirective::Strict), ..PatchParams::apply(MANAGER) };
     match pods_as_given(context, namespace).patch(&name, &params.dry_run().force(), &Patch::Apply(&pod)).await {
         Ok(_) => Ok(()),
+        // that passes when somebody else's pods end
+        Err(kube::Error::Api(e)) if e.code == 403 && e.message.contains("exceeded quota") => {
+            Err(Error::Refused(format!("there is no room for the workers' pods: {}", e.message)))
+        }
         // a field that there is not is refused with 500
         Err(kube::Error::Api(e)) if matches!(e.code, 400 | 403 | 422) || e.message.contains("typed patch") => {
             Err(Error::Template(format!(
@@ -483,7 +582,8 @@ async fn tell(
         Err(e) => return Err(api("write the status")(e)),
     }
     for condition in status::news(known.as_ref(), &status) {
-        let bad = condition.type_ == "Failed" || condition.status == "False";
+        let bad =
+            condition.type_ == "Failed" || condition.status == "False" || condition.reason == status::PODS_REFUSED;
         let event = Event {
             type_: if bad { EventType::Warning } else { EventType::Normal },
             reason: if condition.type_ == "Prepared" { "Prepared".into() } else { condition.reason.clone() },

@@ -73,7 +73,7 @@ pub fn start(
         generation: job.metadata.generation.unwrap_or(0),
         spec: job.spec.clone(),
         fleet: Fleet::new(slots.len() as u32, &session),
-        storage,
+        storage: storage.into(),
         state: begun.into(),
     });
     let keeper = Kept { ledger: Ledger::new(client, &job, Handle::current()), running: running.clone() };
@@ -146,7 +146,7 @@ impl Keeper for Kept {
     fn placed(&self, bytes: &[u64]) {
         let mut state = self.running.lock();
         state.held.clear();
-        for (endpoint, bytes) in self.running.storage.endpoints.iter().zip(bytes) {
+        for (endpoint, bytes) in self.running.storage().endpoints.iter().zip(bytes) {
             if let Some(node) = &endpoint.node {
                 *state.held.entry(node.clone()).or_default() += bytes;
             }

@@ -11,6 +11,9 @@ use rayherd_herd::report::{Kind, Op, Place};
 
 use crate::jobs::{Running, State};
 
+/// Reason of the condition `Running` while the API server takes no pods for some workers.
+pub const PODS_REFUSED: &str = "PodsRefused";
+
 /// A job cannot be run as it stands.
 pub fn refused(job: &RenderJobObject, reason: &str, message: &str, for_good: bool, now: Timestamp) -> RenderJobStatus {
     let mut status = known(job);
@@ -99,6 +102,7 @@ pub fn news<'s>(known: Option<&RenderJobStatus>, status: &'s RenderJobStatus) ->
     let has_failed = status.phase.as_deref() == Some("Failed");
     let telling = |c: &&Condition| match (c.type_.as_str(), c.status.as_str()) {
         ("Prepared" | "Degraded" | "Suspended" | "Complete" | "Failed", "True") => true,
+        ("Running", _) => c.reason == PODS_REFUSED,
         // what fails says so once
         ("Accepted", "False") => !has_failed,
         _ => false,
@@ -110,8 +114,7 @@ pub fn news<'s>(known: Option<&RenderJobStatus>, status: &'s RenderJobStatus) ->
 pub fn running(job: &RenderJobObject, running: &Running, now: Timestamp) -> RenderJobStatus {
     let (state, tally) = (running.lock().clone(), running.fleet.tally());
     let wanted = crate::build::slots(job).len();
-    let local = running.storage.endpoints.iter().all(|e| e.node.is_some());
-    of(job, &state, &tally, wanted, local, now)
+    of(job, &state, &tally, wanted, running.is_local(), now)
 }
 
 fn of(
@@ -184,7 +187,12 @@ fn of(
         set(job, &mut status, "Suspended", "False", "Resumed", "", now);
     }
     let is = |yes: bool| if yes { "True" } else { "False" };
-    set(job, &mut status, "Running", is(matches!(phase, "Preparing" | "Rendering")), phase, "", now);
+    match &state.refused {
+        Some(why) if state.end.is_none() => {
+            set(job, &mut status, "Running", is(tally.ready > 0), PODS_REFUSED, why, now);
+        }
+        _ => set(job, &mut status, "Running", is(matches!(phase, "Preparing" | "Rendering")), phase, "", now),
+    }
     match &state.end {
         Some((at, Ok(()))) => {
             set(job, &mut status, "Complete", "True", "Rendered", "all pictures are written", *at);
@@ -303,6 +311,18 @@ mod tests {
     }
 
     #[test]
+    fn far_reads_are_a_share_only_where_something_is_near() {
+        use rayherd_herd::report::{Bytes, Stage};
+        let mut bytes = Bytes::default();
+        bytes.add(Stage::Trace, Op::Read, Kind::Geometry, Place::Remote, 100);
+        let tally = Tally { bytes, ..Tally::default() };
+        for (local, locality, ratio) in [(true, "per node", Some("1.000")), (false, "none", None)] {
+            let status = of(&job(json!({})), &State::default(), &tally, 1, local, at(0));
+            assert_eq!((status.locality.as_deref(), status.remote_read_ratio.as_deref()), (Some(locality), ratio));
+        }
+    }
+
+    #[test]
     fn each_change_is_told_once() {
         let told = |known: Option<&RenderJobStatus>, status: &RenderJobStatus| -> Vec<String> {
             news(known, status).iter().map(|c| c.type_.clone()).collect()
@@ -315,6 +335,15 @@ mod tests {
         let mut state = State { scene: Some("s".into()), ..State::default() };
         let prepared = of(&new, &state, &Tally::default(), 1, true, at(0));
         assert_eq!(told(None, &prepared), ["Prepared"]);
+        // no pods: that is told once, and when it is over there is nothing more to tell
+        state.refused = Some("exceeded quota".into());
+        let without = of(&new, &state, &Tally::default(), 1, true, at(0));
+        assert_eq!(told(Some(&prepared), &without), ["Running"]);
+        assert_eq!(told(Some(&without), &of(&new, &state, &Tally::default(), 1, true, at(1))), [""; 0]);
+        let running = without.conditions.iter().find(|c| c.type_ == "Running").unwrap();
+        assert_eq!((running.status.as_str(), running.message.as_str()), ("False", "exceeded quota"));
+        state.refused = None;
+        assert_eq!(told(Some(&without), &of(&new, &state, &Tally::default(), 1, true, at(1))), [""; 0]);
         state.end = Some((at(1), Ok(())));
         let complete = of(&new, &state, &Tally::default(), 1, true, at(1));
         assert_eq!(told(Some(&prepared), &complete), ["Complete"]);

@@ -66,6 +66,11 @@ pub async fn storage(client: &Client, own: &str, spec: &StorageSpec) -> Result<S
     Ok(Storage { bucket, prefix, region, endpoints, identity, service_account })
 }
 
+/// Whether the storage has servers on nodes. One that is away just now is on none.
+pub fn is_local(storage: &Storage) -> bool {
+    storage.endpoints.iter().any(|e| e.node.is_some())
+}
+
 /// The servers of a StatefulSet in the order of their numbers, with the nodes that they run on now. One that is away has its place
 /// all the same: it may be back, and what the others hold must not be looked for elsewhere meanwhile.
 fn servers(slices: &[EndpointSlice], service: &Service) -> Vec<Endpoint> {
@@ -127,5 +132,8 @@ mod tests {
         assert_eq!(found[1].url, "http://minio-1.minio.store.svc:9000");
         let nodes: Vec<Option<&str>> = found.iter().map(|e| e.node.as_deref()).collect();
         assert_eq!(nodes, [Some("b"), None, Some("c")]);
+        let storage = |endpoints| Storage { bucket: "b".into(), region: "r".into(), endpoints, ..Storage::default() };
+        assert!(is_local(&storage(found)), "the one that is away makes no other far");
+        assert!(!is_local(&storage(vec![Endpoint { url: "https://s3".into(), node: None }])));
     }
 }

@@ -208,6 +208,69 @@ async fn a_good_job_gets_its_finalizer_then_one_worker_that_prepares() {
     running.fleet.cancel("the test is over");
 }
 
+/// Requests of a job that begins, up to the list of its pods.
+fn begins(pods: Value) -> Vec<Step> {
+    let profile = json!({
+        "metadata": {"name": "rayherd-storage-default"},
+        "data": {"profile.yaml": "bucket: herd\nendpoints: [{url: 'http://127.0.0.1:1', node: node1}]"},
+    });
+    let secret = json!({"metadata": {"name": "rayherd-storage"}, "data": {"AWS_ACCESS_KEY_ID": "YQ==", "AWS_SECRET_ACCESS_KEY": "Yg=="}});
+    let mut with_finalizer = job();
+    with_finalizer["metadata"]["finalizers"] = json!([FINALIZER]);
+    vec![
+        step("GET", PROFILE, 200, profile),
+        step("GET", SECRET, 200, secret),
+        step("PATCH", JOB, 200, with_finalizer),
+        step("GET", PODS, 200, pods),
+    ]
+}
+
+#[tokio::test]
+async fn pods_that_are_refused_are_told_of_and_made_later() {
+    let quota = json!({"kind": "Status", "apiVersion": "v1", "status": "Failure", "reason": "Forbidden", "code": 403,
+        "message": "pods \"box-w0\" is forbidden: exceeded quota: team"});
+    let mut steps = begins(no_pods());
+    steps.extend([
+        step("PATCH", "/api/v1/namespaces/studio/pods/box-w0?", 403, quota),
+        step("PATCH", STATUS, 200, job()).with("/status/phase", json!("Pending")),
+        event("Warning", "PodsRefused"),
+    ]);
+    let (done, said, context) = scenario(&job(), steps).await;
+    assert_ne!(done.unwrap(), Action::await_change());
+    assert!(said[5].to_string().contains("does not take the pod of worker 0: pods"), "{}", said[5]);
+    assert_eq!(context.metrics.errors.get(), 1);
+    let running = context.jobs.get("u-1").expect("it runs");
+    assert!(!running.lock().rests.may(0, Timestamp::now()), "not at once");
+    running.fleet.cancel("the test is over");
+}
+
+#[tokio::test]
+async fn a_pod_that_failed_goes_and_the_next_comes_after_a_rest() {
+    let pod = json!({"kind": "Pod", "apiVersion": "v1", "metadata": {"name": "box-w0"}});
+    let failed = json!({"kind": "PodList", "apiVersion": "v1", "metadata": {}, "items": [
+        {"metadata": {"name": "box-w0", "labels": {"rayherd.io/worker": "0"}}, "status": {"phase": "Failed", "reason": "Evicted"}},
+    ]});
+    let mut steps = begins(failed);
+    steps.extend([
+        step("DELETE", "/api/v1/namespaces/studio/pods/box-w0?", 200, pod),
+        step("PATCH", STATUS, 200, job()).with("/status/phase", json!("Pending")),
+    ]);
+    let (done, _, context) = scenario(&job(), steps).await;
+    assert_ne!(done.unwrap(), Action::await_change());
+    context.jobs.get("u-1").expect("it runs").fleet.cancel("the test is over");
+}
+
+#[tokio::test]
+async fn failures_of_a_job_make_it_wait_longer_each_time() {
+    let (context, _server) = context();
+    let seen: Arc<Seen> = Arc::new(serde_json::from_value(job()).unwrap());
+    let error = crate::reconcile::Error::Clean("no".into());
+    let rests: Vec<String> =
+        (0..6).map(|_| format!("{:?}", crate::reconcile::failed(seen.clone(), &error, context.clone()))).collect();
+    let distinct: std::collections::BTreeSet<&String> = rests.iter().collect();
+    assert_eq!(distinct.len(), 6, "{rests:?}");
+}
+
 #[tokio::test]
 async fn a_finished_job_loses_its_workers_and_then_there_is_silence() {
     let mut finished = job();

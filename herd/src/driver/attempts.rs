@@ -69,6 +69,14 @@ impl<F: FilmSum> Driver<'_, '_, F> {
             if !executor.has_room() {
                 return;
             }
+            // what was planned when there was more memory ends where it is, or is planned anew
+            let bytes = match &self.running[&task].spec.set {
+                Set::Resident(set) => set.iter().map(|&s| self.shared.scene.split_bytes(s)).sum(),
+                Set::Any | Set::Sharing(_) | Set::Reduce => 0,
+            };
+            if bytes > self.memory {
+                continue;
+            }
             let Some(first) = self.live.iter().find(|(k, _)| k.0 == task).map(|(_, l)| l.node) else { continue };
             let ranks: Vec<u32> = match &self.running[&task].spec.set {
                 Set::Resident(set) if settings.strategy == plan::Strategy::Auto => {

@@ -45,6 +45,9 @@ pub enum Event {
     NodeLost(u32),
     /// A node has lost what it held in memory.
     MemoryLost(u32),
+    /// Workers were killed for lack of memory: what is planned from now on must fit [`Executor::memory`], and all of them have lost what
+    /// they held.
+    LessMemory,
     /// A store is silent, and has been for so long that what lay on it is to be copied again.
     StoreLost(u32),
 }
@@ -55,6 +58,10 @@ pub trait Executor {
     fn is_up(&self, node: u32) -> bool;
     /// Nodes next to a copy of each split, where the executor knows better than the job's own nodes.
     fn holders(&self) -> Option<Vec<Vec<u32>>> {
+        None
+    }
+    /// Scene data that a task may hold, bytes, where that is less than the job's settings say.
+    fn memory(&self) -> Option<u64> {
         None
     }
     /// Copies objects that lie on a store which is silent, from the copies that are left; where they lie now.

@@ -80,6 +80,8 @@ pub struct Driver<'s, 'a, F> {
     windows: Vec<BTreeSet<u32>>,
     /// Where tasks run on other machines: what each node was given last, as far as its memory holds it, the newest at the end.
     recent: Vec<Vec<u32>>,
+    /// What a node may hold of the scene, where it is less than was given: bytes.
+    memory: u64,
     traffic: Traffic,
     free: Vec<u32>,
     running: BTreeMap<TaskId, Running>,
@@ -143,6 +145,7 @@ impl<'s, 'a, F: FilmSum> Driver<'s, 'a, F> {
             parts: 1.0,
             windows: vec![BTreeSet::new(); shared.settings.nodes.len()],
             recent: vec![Vec::new(); shared.settings.nodes.len()],
+            memory: u64::MAX,
             traffic: Traffic::default(),
             free: shared.settings.nodes.iter().map(|n| n.slots).collect(),
             running: BTreeMap::new(),
@@ -171,6 +174,7 @@ impl<'s, 'a, F: FilmSum> Driver<'s, 'a, F> {
     /// When it cannot be finished; what was committed stays.
     pub fn run(&mut self, executor: &dyn Executor) -> Result<(), JobError> {
         let barrier = self.shared.settings.has_barrier();
+        self.memory = executor.memory().unwrap_or(u64::MAX);
         loop {
             if self.queued > 0 && self.is_step_over() && self.step_done()? {
                 return Ok(());
@@ -204,6 +208,7 @@ impl<'s, 'a, F: FilmSum> Driver<'s, 'a, F> {
                 Some(Event::NodeLost(node)) => self.lose_node(node)?,
                 // what it is planned to hold must be loaded again, by whoever is nearest
                 Some(Event::MemoryLost(node)) => self.forget(node),
+                Some(Event::LessMemory) => self.take_less(executor),
                 Some(Event::StoreLost(store)) => self.lose_copies(executor, store)?,
                 None => {}
             }

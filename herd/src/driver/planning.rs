@@ -86,23 +86,34 @@ impl<F: FilmSum> Driver<'_, '_, F> {
                 memory.warm().into_iter().map(|s| self.rank[s as usize]).collect()
             };
             let up = |slots| if executor.is_up(n as u32) { slots } else { 0 };
-            NodeView { slots: up(spec.slots), free: up(self.free[n]), memory: memory.capacity(), warm }
+            NodeView { slots: up(spec.slots), free: up(self.free[n]), memory: self.capacity(n as u32), warm }
         };
         settings.nodes.iter().enumerate().map(node).collect()
     }
 
     /// Remembers that a node was given splits: the oldest go when its memory does not hold all, as they do there.
     pub(super) fn remember(&mut self, node: u32, ranks: &[u32]) {
-        let (scene, order) = (self.shared.scene, &self.order);
+        let (scene, order, capacity) = (self.shared.scene, &self.order, self.capacity(node));
         let held = &mut self.recent[node as usize];
         held.retain(|r| !ranks.contains(r));
         held.extend(ranks);
         let bytes = |r: &u32| scene.split_bytes(order[*r as usize]);
         let mut sum: u64 = held.iter().map(bytes).sum();
-        let capacity = self.shared.nodes.memory(node).capacity();
         while sum > capacity && held.len() > ranks.len() {
             sum -= bytes(&held.remove(0));
         }
+    }
+
+    /// What a node may hold of the scene, bytes.
+    pub(super) fn capacity(&self, node: u32) -> u64 {
+        self.shared.nodes.memory(node).capacity().min(self.memory)
+    }
+
+    /// Nodes have too little memory for what they were given: the scene is cut anew for what they may hold now.
+    pub(super) fn take_less(&mut self, executor: &dyn Executor) {
+        self.memory = executor.memory().unwrap_or(u64::MAX);
+        (0..self.free.len() as u32).for_each(|n| self.forget(n));
+        self.cut = None;
     }
 
     /// A node has lost what it held.
@@ -113,15 +124,14 @@ impl<F: FilmSum> Driver<'_, '_, F> {
 
     /// Remembers the window that a node of `auto` is to hold: beside what it holds if there is room, else instead of it.
     pub(super) fn hold(&mut self, node: u32, ranks: &[u32]) {
-        let scene = self.shared.scene;
+        let (scene, capacity) = (self.shared.scene, self.capacity(node));
         let held = &mut self.windows[node as usize];
         let both: BTreeSet<u32> = held.iter().chain(ranks).copied().collect();
         let bytes: u64 = both.iter().map(|&r| scene.split_bytes(self.order[r as usize])).sum();
         // windows that overlap would be in memory twice
         let there = ranks.iter().filter(|r| held.contains(r)).count();
-        let beside = (there == 0 || there == ranks.len())
-            && bytes <= self.shared.nodes.memory(node).capacity()
-            && !self.cut.as_ref().is_none_or(Vec::is_empty);
+        let beside =
+            (there == 0 || there == ranks.len()) && bytes <= capacity && !self.cut.as_ref().is_none_or(Vec::is_empty);
         *held = if beside { both } else { ranks.iter().copied().collect() };
     }
 }

@@ -48,7 +48,17 @@ pub struct JobOutcome {
 /// Integers from 1 that a float of 32 bits holds.
 const MOST_NUMBERS: usize = 1 << 24;
 
-/// Checks what can be checked before anything is read.
+/// Checks the copies of a job that runs in this process, where nodes are stores as well.
+pub(crate) fn check_copies(settings: &JobSettings) -> Result<(), JobError> {
+    let nodes = settings.nodes.len() as u32;
+    if settings.replicas == 0 || settings.replicas > nodes {
+        let message = format!("{} copies on {nodes} node(s): give 1 to {nodes} replicas", settings.replicas);
+        return Err(JobError::Settings(message));
+    }
+    Ok(())
+}
+
+/// Checks what can be checked before anything is read, wherever a job runs.
 pub(crate) fn check(
     scene: &PreparedScene,
     frame: &Frame,
@@ -71,10 +81,6 @@ pub(crate) fn check(
     }
     if settings.nodes.len() > 1000 || settings.slots() > 10_000 {
         return refuse("at most 1000 nodes and 10000 slots run in one process".into());
-    }
-    let nodes = settings.nodes.len() as u32;
-    if settings.replicas == 0 || settings.replicas > nodes {
-        return refuse(format!("{} copies on {nodes} node(s): give 1 to {nodes} replicas", settings.replicas));
     }
     if !(settings.task_seconds > 0.0 && settings.task_seconds.is_finite()) {
         return refuse("the size of a task must be above 0 seconds".into());

@@ -13,7 +13,7 @@ use super::nodes::Nodes;
 use super::owner::Ownership;
 use super::slots::Gate;
 use super::threads::Threads;
-use super::{JobOutcome, check, journal};
+use super::{JobOutcome, check, check_copies, journal};
 use crate::driver::{Driver, Pointer, Start};
 use crate::job::{JobError, JobSettings, PreparedScene, Progress, Sampling};
 use crate::ledger::Ledger;
@@ -37,6 +37,7 @@ pub fn render_local(
     progress: &dyn Progress,
 ) -> Result<JobOutcome, JobError> {
     check(scene, frame, sampling, settings)?;
+    check_copies(settings)?;
     let spilling = settings.commits.is_none().then(|| Arc::new(Spilling::new(AT_REST_IN_MEMORY, |_| ())));
     let store = match (&settings.commits, &spilling) {
         (Some(commits), _) => commits.store.clone(),

@@ -46,6 +46,49 @@ pub fn holders(sizes: &[u64], nodes: u32, replicas: u32) -> Vec<Vec<u32>> {
         .collect()
 }
 
+/// Nodes in an order of their own for each name: rendezvous hashing (Thaler and Ravishankar 1998), so that scenes spread over nodes.
+pub fn ranked(name: &[u8], nodes: u32) -> Vec<u32> {
+    let weight = |node: &u32| *blake3::Hasher::new().update(&node.to_le_bytes()).update(name).finalize().as_bytes();
+    let mut order: Vec<u32> = (0..nodes).collect();
+    order.sort_by_cached_key(weight);
+    order
+}
+
+/// As [`holders`], but the first `homes` of the ranked nodes hold the first copies of all, so that as many workers beside them read
+/// nothing from afar. The other copies lie on the other nodes, also in connected pieces, as long as none of these holds more than a home;
+/// else each goes where least lies.
+pub fn gathered(sizes: &[u64], ranked: &[u32], homes: u32, replicas: u32) -> Vec<Vec<u32>> {
+    let nodes = ranked.len() as u32;
+    let homes = homes.clamp(1, nodes.max(1));
+    let more = replicas.clamp(1, nodes.max(1)) - 1;
+    let mut load = vec![0u64; nodes as usize];
+    let mut on = holders(sizes, homes, 1);
+    // along each home's piece, all pieces side by side: what is dealt in this order fills no node before its time
+    let mut order: Vec<(u64, u32, usize)> = Vec::with_capacity(sizes.len());
+    for (i, &size) in sizes.iter().enumerate() {
+        order.push((load[on[i][0] as usize], on[i][0], i));
+        load[on[i][0] as usize] += size;
+    }
+    let others = nodes - homes;
+    if others >= more * homes {
+        for (on, piece) in on.iter_mut().zip(holders(sizes, others, more)).filter(|_| more > 0) {
+            on.extend(piece.into_iter().map(|p| homes + p));
+        }
+    } else {
+        order.sort_unstable();
+        for (_, _, i) in order {
+            for _ in 0..more {
+                let free = (0..nodes).filter(|n| !on[i].contains(n));
+                let Some(least) = free.min_by_key(|&n| (load[n as usize], std::cmp::Reverse(n))) else { break };
+                load[least as usize] += sizes[i];
+                on[i].push(least);
+            }
+        }
+    }
+    on.iter_mut().flatten().for_each(|n| *n = ranked[*n as usize]);
+    on
+}
+
 /// The window of at most `memory` bytes with most rays, and how many; of equals the first; none without rays. `before`: bytes of all splits before each
 /// one, and of all; `with`: the splits that have rays, ascending.
 pub fn fullest(

@@ -7,8 +7,10 @@ use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
+use rayherd_api::ByteSize;
 use tokio::sync::Notify;
 
+use super::deaths::{Deaths, Held, MOST_DEATHS, MOST_KILLED, Verdict, keys};
 use super::message::{Answer, Beat, Done, Failure, Poll, Report, Stage, Work, WorkerId};
 use crate::driver::{Event, Executor, Finished, Launch};
 use crate::job::JobError;
@@ -38,6 +40,15 @@ struct State {
     epoch: String,
     next: u64,
     stage: Option<Stage>,
+    /// The stage before memory was taken away from it: its name, and what a worker was to hold of the scene.
+    whole: (String, Option<u64>),
+    /// The least that a worker must hold of the scene: its largest split.
+    least: u64,
+    /// Tasks are to hold less from now on, and whoever plans them does not know yet.
+    less: bool,
+    deaths: Deaths,
+    /// Why the job cannot be done.
+    hopeless: Option<String>,
     /// Stores that hold each split.
     placement: Vec<Vec<u32>>,
     workers: Vec<Option<Worker>>,
@@ -76,6 +87,7 @@ struct Worker {
 struct Doing {
     worker: u32,
     what: What,
+    held: Held,
 }
 
 enum What {
@@ -109,9 +121,13 @@ impl Fleet {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Another frame begins: workers open its stage.
-    pub fn open(&self, stage: Stage, placement: Vec<Vec<u32>>) {
+    /// Another frame begins: workers open its stage. `least` is the largest split, bytes: what a worker must be able to hold.
+    pub fn open(&self, stage: Stage, placement: Vec<Vec<u32>>, least: u64) {
         let mut state = self.lock();
+        state.whole = (stage.id.clone(), stage.memory);
+        state.least = least;
+        state.less = false;
+        let stage = Stage { memory: state.memory(), ..stage };
         state.placement = placement;
         state.read = Default::default();
         state.stage = Some(stage);
@@ -160,6 +176,48 @@ impl Fleet {
     pub fn homes(&self) -> Vec<Option<u32>> {
         self.lock().workers.iter().map(|w| w.as_ref().and_then(|w| w.home)).collect()
     }
+    /// The process of a worker was killed for lack of memory, of which its pod may take so much. Once for each.
+    ///
+    /// Its tasks are done again with half of the splits in memory, twice; then, or when it was no task, the job is given up.
+    pub fn killed_for_memory(&self, number: u32, limit: Option<&str>) {
+        let mut state = self.lock();
+        if !state.deaths.is_unexplained(number) && !state.leave(number) {
+            // it never asked for work
+            state.deaths.left(number, "", Vec::new());
+        }
+        let limit = limit.unwrap_or("no limit of memory, but its node has one");
+        match state.deaths.for_memory(number) {
+            Verdict::Again => {
+                tracing::warn!("worker {number} was killed for lack of memory (limit of its pod: {limit})")
+            }
+            Verdict::Less => {
+                state.less = true;
+                let now = state.memory().map_or_else(|| "nothing less".into(), |m| ByteSize::new(m).to_string());
+                tracing::warn!(
+                    "worker {number} was killed for lack of memory (limit of its pod: {limit}): tasks hold {now} of the scene from now on"
+                );
+            }
+            Verdict::TooMuch => {
+                let size = |m: Option<u64>| m.map_or_else(|| "all".into(), |m| ByteSize::new(m).to_string());
+                let tried: Vec<String> =
+                    (0..MOST_KILLED).map(|l| size(halved(state.whole.1, l, state.least))).collect();
+                state.hopeless = Some(format!(
+                    "workers were killed for lack of memory, with {} of the scene in memory at most (the largest split takes {} bytes), and \
+                     a pod may take {limit}: {GIVE_MORE}",
+                    tried.join(", then "),
+                    state.least
+                ));
+            }
+            Verdict::Hopeless(what) => {
+                state.hopeless = Some(format!(
+                    "{what}: {MOST_KILLED} workers were killed for lack of memory, and a pod may take {limit}: {GIVE_MORE}"
+                ));
+            }
+        }
+        drop(state);
+        self.tell();
+    }
+
     /// A pod is known to be gone: its work goes back at once. Another session's is left alone.
     pub fn gone(&self, worker: &WorkerId) {
         let mut state = self.lock();
@@ -209,6 +267,7 @@ impl Fleet {
             return Ok(Answer::Open { stage: state.stage.clone().map(Box::new) });
         }
         let id = format!("{}-{}", state.epoch, state.next);
+        let level = state.deaths.level();
         let in_stage = poll.stage.is_some();
         let worker = state.workers[poll.worker.number as usize].as_mut().ok_or(Unknown)?;
         worker.open |= in_stage;
@@ -227,7 +286,8 @@ impl Fleet {
             return Ok(Answer::Wait);
         };
         state.next += 1;
-        state.doing.insert(id.clone(), Doing { worker: poll.worker.number, what });
+        let held = Held { keys: keys(&work), level: matches!(what, What::Attempt { .. }).then_some(level) };
+        state.doing.insert(id.clone(), Doing { worker: poll.worker.number, what, held });
         Ok(Answer::Work { id, work: Box::new(work) })
     }
 
@@ -246,7 +306,11 @@ impl Fleet {
         report.bytes.iter().for_each(|r| bytes.add(r.stage, r.op, r.kind, r.place, r.bytes));
         state.bytes.merge(&bytes);
         state.cpu += report.cpu;
-        if state.stage.as_ref().is_some_and(|s| s.id == report.reads.stage) {
+        if !matches!(report.result, Err(Failure::Stopped)) {
+            state.deaths.came_out(report.worker.number, &doing.held.keys);
+        }
+        // by the name that the stage had before memory was taken away
+        if state.stage.is_some() && report.reads.stage.split('+').next() == Some(&state.whole.0) {
             state.read[0].extend(report.reads.splits);
             state.read[1].extend(report.reads.tiles);
         }
@@ -402,12 +466,44 @@ impl Fleet {
     }
 }
 
+/// What helps where a pod's memory is too little.
+const GIVE_MORE: &str = "raise resources.limits.memory of the container worker in spec.workers.template (without it a pod gets \
+     spec.workers.memory and 256Mi, and 256Mi more for each slot), or have fewer spec.workers.slots or a smaller spec.blockSize";
+
+/// Memory that was halved so often, but holds the largest split.
+fn halved(memory: Option<u64>, level: u32, least: u64) -> Option<u64> {
+    memory.map(|m| (m >> level).max(least.min(m)))
+}
+
 /// There is no worker of this number in the job.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("the job has no worker of this number")]
 pub struct Unknown;
 
 impl State {
+    /// What a worker is to hold of the scene at most, bytes.
+    fn memory(&self) -> Option<u64> {
+        halved(self.whole.1, self.deaths.level(), self.least)
+    }
+
+    /// Workers open the stage anew with the memory that is left to them; what none of them has begun goes back.
+    fn reopen(&mut self) {
+        let (memory, level) = (self.memory(), self.deaths.level());
+        let id = format!("{}+{level}", self.whole.0);
+        if let Some(stage) = &mut self.stage {
+            (stage.id, stage.memory) = (id, memory);
+        }
+        let workers = self.workers.iter_mut().flatten();
+        let ready: Vec<_> = workers
+            .flat_map(|w| {
+                w.open = false;
+                std::mem::take(&mut w.ready)
+            })
+            .collect();
+        ready.into_iter().for_each(|(task, number, ..)| self.lose(task, number));
+        self.emptied.clear();
+    }
+
     /// Notes that a worker is there; whether it was not before.
     fn meet(&mut self, worker: &WorkerId, home: Option<u32>) -> Result<bool, Unknown> {
         let number = worker.number as usize;
@@ -415,6 +511,12 @@ impl State {
         let newcomer = known.is_none_or(|w| w.session != worker.session);
         if newcomer {
             self.leave(worker.number);
+            if let Some(what) = self.deaths.began(worker.number, &worker.session) {
+                self.hopeless = Some(format!(
+                    "{what}: {MOST_DEATHS} times the worker that had it in hand died: the pods' last logs (kubectl logs --previous) and \
+                     kubectl describe say of what"
+                ));
+            }
             let (session, seen) = (worker.session.clone(), Instant::now());
             self.workers[number] =
                 Some(Worker { session, home, seen, ready: VecDeque::new(), open: false, bands: true });
@@ -426,10 +528,12 @@ impl State {
         Ok(newcomer)
     }
 
-    /// A worker is gone: what it did is lost, what any worker can do is done by another.
-    fn leave(&mut self, number: u32) {
-        let Some(worker) = self.workers[number as usize].take() else { return };
+    /// A worker is gone: what it did is lost, what any worker can do is done by another. Whether it was there.
+    fn leave(&mut self, number: u32) -> bool {
+        let Some(worker) = self.workers.get_mut(number as usize).and_then(Option::take) else { return false };
         self.emptied.insert(number);
+        let held = self.doing.values().filter(|d| d.worker == number).map(|d| d.held.clone()).collect();
+        self.deaths.left(number, &worker.session, held);
         for (task, attempt, _, _) in worker.ready {
             self.lose(task, attempt);
         }
@@ -442,6 +546,7 @@ impl State {
                 None => {}
             }
         }
+        true
     }
 
     fn lose(&mut self, task: TaskId, number: u32) {
@@ -476,6 +581,9 @@ impl State {
     }
 
     fn check(&self) -> Result<(), JobError> {
+        if let Some(why) = &self.hopeless {
+            return Err(JobError::Settings(why.clone()));
+        }
         self.cancelled.as_ref().map_or(Ok(()), |why| Err(JobError::Owned(why.clone())))
     }
 
@@ -511,6 +619,9 @@ impl Executor for Fleet {
         };
         Some(state.placement.iter().map(near).collect())
     }
+    fn memory(&self) -> Option<u64> {
+        self.lock().memory()
+    }
     fn has_room(&self) -> bool {
         true
     }
@@ -530,8 +641,14 @@ impl Executor for Fleet {
         let mut state = self.lock();
         state.check()?;
         state.sweep();
-        if state.finished.is_empty() && state.emptied.is_empty() {
+        if state.finished.is_empty() && state.emptied.is_empty() && !state.less {
             state = self.wait(state, wait);
+        }
+        // here, where whoever plans listens: nothing is launched any more that was planned for more memory
+        if std::mem::take(&mut state.less) {
+            state.reopen();
+            self.wanted.notify_waiters();
+            return Ok(Some(Event::LessMemory));
         }
         if let Some(worker) = state.emptied.pop_first() {
             return Ok(Some(Event::MemoryLost(worker)));

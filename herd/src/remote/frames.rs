@@ -11,6 +11,7 @@ use tokio::runtime::Handle;
 
 use super::bands;
 use super::guard::Guard;
+use super::homes::Homes;
 use super::message::{Done, Stage, Work};
 use super::parts::Parts;
 use super::{Depot, Fleet, Turns};
@@ -19,7 +20,7 @@ use crate::job::{JobError, JobSettings, NodeSpec, PreparedScene, Progress, Sampl
 use crate::ledger::{FilmRef, Ledger, Scope, Snapshot, is_of_cut, record_key};
 use crate::local::attempt::{FilmUse, Shared};
 use crate::local::journal;
-use crate::local::nodes::{Nodes, placement};
+use crate::local::nodes::Nodes;
 use crate::report;
 use crate::store::{BlockStore, SceneObjects, StoreError, object_key};
 
@@ -84,7 +85,13 @@ pub fn run(job: &Job, keeper: &Arc<dyn Keeper>, progress: &dyn Progress) -> Resu
 
 fn frames(job: &Job, keeper: &Arc<dyn Keeper>, progress: &dyn Progress) -> Result<(), JobError> {
     let spec = job.spec;
-    let replicas = spec.replicas.map_or(1, |r| r as u32).clamp(1, job.depot.len());
+    let replicas = spec.replicas.map_or(1, |r| r as u32).max(1);
+    if replicas > job.depot.len() {
+        let servers = job.depot.len();
+        return Err(JobError::Settings(format!(
+            "spec.replicas is {replicas}, but the storage has {servers} server(s): ask for at most one copy on each"
+        )));
+    }
     let (reference, reused, cells_passed) = match known(job, replicas)? {
         Some(known) => (known, true, 0),
         None => prepared(job, replicas)?,
@@ -93,7 +100,8 @@ fn frames(job: &Job, keeper: &Arc<dyn Keeper>, progress: &dyn Progress) -> Resul
     let store = Arc::new(job.depot.replicated(replicas)?);
     let objects: Arc<dyn ObjectStore> = Arc::new(SceneObjects::new(store, job.runtime.clone())?);
     let scene = PreparedScene::open(Manifest::load(objects.as_ref(), &reference)?, objects)?;
-    let places = placement(&scene, job.depot.len(), replicas);
+    let homes = Homes::of(&scene, job.depot.len(), replicas);
+    let places = homes.splits();
     let mut bytes = vec![0; job.depot.len() as usize];
     for (split, on) in places.iter().enumerate() {
         on.iter().for_each(|&n| bytes[n as usize] += scene.split_bytes(split as u32));
@@ -119,7 +127,7 @@ fn frames(job: &Job, keeper: &Arc<dyn Keeper>, progress: &dyn Progress) -> Resul
             near: spec.placement != Placement::None,
             buckets: job.slots.iter().sum(),
         };
-        let (at, mut report) = render(job, keeper, progress, &scene, &stage, &places, &sampling, (number, picture))?;
+        let (at, mut report) = render(job, keeper, progress, &scene, &stage, places, &sampling, (number, picture))?;
         // known to whoever prepared the scene
         let kept = if reused { scene.manifest.objects().count() as u64 } else { 0 };
         for (skip, count) in [(Skip::Prepared, kept), (Skip::Volume, cells_passed)] {
@@ -196,7 +204,8 @@ fn render(
     let pointer = FramePointer { keeper: keeper.clone(), frame: number };
     // where nobody looks where data lies, nobody holds any
     let places = if stage.near { places.to_vec() } else { vec![Vec::new(); places.len()] };
-    job.fleet.open(stage.clone(), places);
+    let least = scene.grid.owning().iter().map(|s| scene.split_bytes(s)).max().unwrap_or(0);
+    job.fleet.open(stage.clone(), places, least);
     let film = (stage.frame.size, stage.band);
     let (resumed, film_lost) = whole(job.fleet, film, states)?;
     // rays that wait for splits of another cut of the scene are of no use

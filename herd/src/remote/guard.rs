@@ -115,6 +115,9 @@ impl Executor for Guard<'_> {
     fn holders(&self) -> Option<Vec<Vec<u32>>> {
         self.fleet.holders()
     }
+    fn memory(&self) -> Option<u64> {
+        self.fleet.memory()
+    }
     fn copy_again(&self, objects: Objects, gone: u32) -> Result<Objects, JobError> {
         match self.fleet.call(Work::Copy { objects, gone })? {
             Done::Copied { objects } => Ok(objects),

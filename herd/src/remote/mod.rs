@@ -5,10 +5,12 @@
 //! loop over rounds ([`crate::driver`]), fed by workers that come and go. How messages travel is not known here.
 
 pub mod bands;
+mod deaths;
 pub mod depot;
 pub mod fleet;
 pub mod frames;
 mod guard;
+mod homes;
 pub mod message;
 mod parts;
 mod prepare;

@@ -12,11 +12,10 @@ use rayherd_scene::prepare::{NoProgress, SpoolSettings, prepare};
 use tokio::runtime::Handle;
 
 use super::Depot;
+use super::homes::Homes;
 use crate::job::spec::{import_options, prepare_settings};
 use crate::job::{JobError, PreparedScene};
-use crate::local::nodes::placement;
 use crate::store::{BlockStore, NodeView, SceneObjects, check_key, object_key};
-use crate::textures::tile_holders;
 
 /// Prepares the scene of a checked job, unless it is prepared; its manifest, whether it was there, and cells of volumes that were not
 /// looked into.
@@ -45,33 +44,41 @@ pub fn prepare_scene(
     let spool = SpoolSettings { folder: Some(scratch.to_owned()), ..SpoolSettings::default() };
     let prepared = prepare(&description, &records, &prepare_settings(spec), &spool, staged.as_ref(), &NoProgress)
         .map_err(|e| JobError::Scene(e.to_string()))?;
+    let mut reference = prepared.reference;
+    let mut made = None;
     if !prepared.reused {
-        let scene = PreparedScene::open(prepared.manifest.clone(), staged.clone())?;
+        // as many homes as there are to be workers
+        let workers = spec.workers.slots_per_node(1).map_or(1, |slots| slots.len() as u32);
+        let mut scene = PreparedScene::open(prepared.manifest.clone(), staged.clone())?;
+        scene.manifest.homes = Homes::chosen(&scene, depot.len(), workers, depot.home());
+        let homes = Homes::of(&scene, depot.len(), replicas);
         let put = |on: &[usize], object: &ObjectRef| -> Result<(), JobError> {
             let body = staged.built.get(object)?;
             Ok(runtime.block_on(store.put_on(on, &object_key(&object.hash), body.into()))?)
         };
-        for (split, on) in prepared.manifest.splits.iter().zip(placement(&scene, depot.len(), replicas)) {
-            let on: Vec<usize> = on.into_iter().map(|n| n as usize).collect();
+        for (split, on) in prepared.manifest.splits.iter().zip(homes.splits()) {
+            let on: Vec<usize> = on.iter().map(|&n| n as usize).collect();
             put(&on, &split.geometry)?;
             put(&on, &split.attributes)?;
         }
         for (number, tile) in (0..).zip(&prepared.manifest.tiles) {
-            let on: Vec<usize> = tile_holders(number, depot.len(), replicas).into_iter().map(|n| n as usize).collect();
+            let on: Vec<usize> = homes.tile(number).into_iter().map(|n| n as usize).collect();
             put(&on, tile)?;
         }
         put(&[], &prepared.manifest.world)?;
         if let Some(map) = &prepared.manifest.sky_map {
             put(&[], map)?;
         }
+        reference = scene.manifest.reference();
+        made = Some(scene.manifest.encode());
     }
     // a new one, or the same scene for another picture
-    if staged.built.has(&prepared.reference)? {
-        let body = staged.built.get(&prepared.reference)?;
-        runtime.block_on(store.put(&object_key(&prepared.reference.hash), body.into()))?;
+    if made.is_some() || staged.built.has(&reference)? {
+        let body = made.map_or_else(|| staged.built.get(&reference), Ok)?;
+        runtime.block_on(store.put(&object_key(&reference.hash), body.into()))?;
         // last: whoever finds the name finds everything that it names
-        if let Some((name, object)) = staged.name.lock().unwrap_or_else(PoisonError::into_inner).take() {
-            staged.stored.set_name(&name, &object)?;
+        if let Some((name, _)) = staged.name.lock().unwrap_or_else(PoisonError::into_inner).take() {
+            staged.stored.set_name(&name, &reference)?;
         }
     }
     drop(staged);
@@ -79,7 +86,7 @@ pub fn prepare_scene(
         let io = |e| JobError::Settings(format!("cannot clean {}: {e}", folder.display()));
         fs::remove_dir_all(&folder).map_err(io)?;
     }
-    Ok((prepared.reference, prepared.reused, records.cells_passed()))
+    Ok((reference, prepared.reused, records.cells_passed()))
 }
 
 /// Copies the source and what lies beside it from the storage; where it is now.
@@ -107,8 +114,9 @@ pub fn download(store: &NodeView, runtime: &Handle, source: &str, folder: &Path)
         let path = folder.join(&key);
         let io = |e: std::io::Error| JobError::Settings(format!("cannot write {}: {e}", path.display()));
         fs::create_dir_all(path.parent().unwrap_or(folder)).map_err(io)?;
+        // never whole in memory: a file may be larger than what a pod may take
         runtime.block_on(store.get_file(&key, &path))?;
-        let file = File::options().read(true).write(true).open(&path).map_err(io)?;
+        let file = File::options().read(true).append(true).open(&path).map_err(io)?;
         let hash = blake3::Hasher::new().update_reader(&file).map_err(io)?.finalize();
         let word = |i: usize| u32::from_le_bytes(std::array::from_fn(|k| hash.as_bytes()[i + k]));
         let time = Duration::new(u64::from(word(0) >> 1), word(4) % 1_000_000_000);

@@ -15,19 +15,19 @@ use tokio::runtime::Runtime;
 
 use super::Depot;
 use super::bands::Adder;
+use super::homes::Homes;
 use super::message::{Answer, Beat, Done, Failure, Poll, Reads, Report, Stage, Work, WorkerId};
 use super::prepare::prepare_scene;
 use crate::job::spec::definition;
 use crate::job::{JobError, JobSettings, NodeSpec, PreparedScene};
 use crate::ledger::FilmRef;
 use crate::local::attempt::{self, Attempt, FilmUse, Shared};
-use crate::local::nodes::{Fetch, Nodes, Part, placement};
+use crate::local::nodes::{Fetch, Nodes, Part};
 use crate::local::slots::StopFlag;
 use crate::local::usage::thread_cpu;
 use crate::report::{Bytes, Kind, Place};
 use crate::store::{SceneObjects, StoreError, object_key};
 use crate::task::{Stop, codec};
-use crate::textures::tile_holders;
 
 /// Between two signs of life.
 const BEAT: Duration = Duration::from_secs(1);
@@ -197,9 +197,8 @@ impl<'l> Station<'l> {
             ..JobSettings::default()
         };
         let part = Arc::new(self.depot.part(&stage.prefix, stage.replicas)?);
-        let placement = placement(&scene, disks, stage.replicas);
-        let near =
-            Near { station: self, placement, replicas: stage.replicas, home: self.depot.home().filter(|_| stage.near) };
+        let homes = Homes::of(&scene, disks, stage.replicas);
+        let near = Near { station: self, homes, home: self.depot.home().filter(|_| stage.near) };
         let nodes = Nodes::real(&scene, &settings, part, disks, Some(Box::new(near)))?.noting_reads();
         let shared = Shared {
             scene: &scene,
@@ -359,8 +358,9 @@ impl<'l> Station<'l> {
     /// Copies of the scene's objects that lay on a store which is silent, made again where there is one.
     fn restore(&self, stage: &Stage, scene: &PreparedScene, gone: u32, stop: &StopFlag) -> Result<Done, JobError> {
         let (count, replicas, m) = (self.depot.len(), stage.replicas, &scene.manifest);
-        let splits = m.splits.iter().zip(placement(scene, count, replicas)).filter(|(_, on)| on.contains(&gone));
-        let tiles = (0..).zip(&m.tiles).filter(|(n, _)| tile_holders(*n, count, replicas).contains(&gone));
+        let homes = Homes::of(scene, count, replicas);
+        let splits = m.splits.iter().zip(homes.splits()).filter(|(_, on)| on.contains(&gone));
+        let tiles = (0..).zip(&m.tiles).filter(|(n, _)| homes.tile(*n).contains(&gone));
         // what belongs to no place may be anywhere
         let others = [&m.world, &stage.scene].into_iter().chain(&m.sky_map);
         let objects = splits.flat_map(|(s, _)| [&s.geometry, &s.attributes]).chain(tiles.map(|t| t.1)).chain(others);
@@ -453,8 +453,7 @@ fn merged(
 /// Reads blocks from the store at home first, then from where they belong, then from anywhere.
 struct Near<'s, 'l> {
     station: &'s Station<'l>,
-    placement: Vec<Vec<u32>>,
-    replicas: u32,
+    homes: Homes,
     /// The store that is asked first, wherever the object belongs.
     home: Option<u32>,
 }
@@ -464,8 +463,8 @@ impl Fetch for Near<'_, '_> {
         let depot = &self.station.depot;
         let (home, first) = (depot.home(), self.home);
         let mut holders = match part {
-            Part::Split(n) => self.placement[n as usize].clone(),
-            Part::Tile(n) => tile_holders(n, depot.len(), self.replicas),
+            Part::Split(n) => self.homes.splits()[n as usize].clone(),
+            Part::Tile(n) => self.homes.tile(n),
         };
         if first.is_none() && !holders.is_empty() {
             // nobody is near: the copies share what is read

@@ -10,6 +10,7 @@ use rayherd_render::aov::Aovs;
 use rayherd_render::film::Layout;
 use rayherd_render::skip::Skip;
 use rayherd_scene::import::{DescriptionSource, StreamOptions, import};
+use rayherd_scene::manifest::Manifest;
 use rayherd_scene::objects::{MemoryObjects, ObjectRef};
 use rayherd_scene::prepare::{NoProgress, SpoolSettings, prepare};
 use tokio::runtime::{Handle, Runtime};
@@ -23,7 +24,7 @@ use crate::job::{JobError, JobSettings, PreparedScene, Sampling, Silent, spec as
 use crate::local::{journal, render_local};
 use crate::picture;
 use crate::report;
-use crate::store::{BlockStore, FaultPlan, Faulty, MemoryStore, Patience, Watched};
+use crate::store::{BlockStore, FaultPlan, Faulty, MemoryStore, Patience, SceneObjects, Watched, object_key};
 
 const EXAMPLE: &str = include_str!("../../../examples/cornell-box.xml");
 const SOURCE: &str = "scenes/cornell/box.xml";
@@ -675,4 +676,173 @@ fn workers_that_wait_are_sent_to_the_next_fleet_at_once() {
         futures::future::join(waiting, retire).await.0
     });
     assert_eq!(waits, Ok(Answer::Wait));
+}
+
+/// A worker that is no station: it takes work, and does none of it.
+struct Hand<'f>(&'f Fleet, &'f dyn Fn() -> bool);
+
+impl Hand<'_> {
+    /// A process of worker 0 takes work, after what stages it is told to open; the memory of the last of these.
+    fn takes(&self, session: &str) -> (Option<u64>, super::Work) {
+        let (mut stage, mut memory) = (None, None);
+        let since = Instant::now();
+        loop {
+            let worker = WorkerId { number: 0, session: session.into() };
+            let poll = Poll { worker, home: None, stage: stage.clone(), clerk: false, bands: true };
+            match self.0.answer(&poll).unwrap() {
+                Answer::Open { stage: now } => (memory, stage) = now.map_or((None, None), |s| (s.memory, Some(s.id))),
+                Answer::Work { work, .. } => return (memory, *work),
+                Answer::Wait => std::thread::sleep(Duration::from_millis(2)),
+                Answer::Over => panic!("it is over"),
+            }
+            assert!(!(self.1)() && since.elapsed() < Duration::from_secs(60), "no work came");
+        }
+    }
+}
+
+/// Runs a job of one worker whose processes are the test's; what came of it.
+fn by_hand(
+    cluster: &Cluster,
+    spec: &RenderJobSpec,
+    known: Option<String>,
+    kept: &Arc<Kept>,
+    hand: impl FnOnce(&Hand, &Wire, &dyn Fn() -> bool),
+) -> Result<(), JobError> {
+    let (fleet, depot) = (Fleet::new(1, "h"), cluster.depot(None));
+    let wire = cluster.wire(&fleet);
+    std::thread::scope(|scope| {
+        let keeper: Arc<dyn Keeper> = kept.clone();
+        let (fleet, depot) = (&fleet, &depot);
+        let job = scope.spawn(move || {
+            let job = Job { known, slots: vec![1], prefix: "jobs/2".into(), ..cluster.job(spec, depot, fleet, "h") };
+            let result = run(&job, &keeper, &Silent);
+            fleet.end();
+            result
+        });
+        let over = || job.is_finished();
+        hand(&Hand(fleet, &over), &wire, &over);
+        job.join().unwrap()
+    })
+}
+
+#[test]
+fn a_task_that_was_killed_for_lack_of_memory_holds_half_and_then_the_job_fails_with_the_sizes() {
+    // one worker, and two copies on as many servers
+    let mut spec = spec(Strategy::Auto, 6, 2);
+    spec.workers.memory = Some("256Ki".parse().unwrap());
+    let (cluster, kept) = (Cluster::new(2), Arc::new(Kept::default()));
+    cluster.render(&spec, &kept).unwrap();
+    let scene = kept.prepared.lock().unwrap()[0].0.hash.to_string();
+    for deaths in [2, 3] {
+        let kept = Arc::new(Kept::default());
+        let done = by_hand(&cluster, &spec, Some(scene.clone()), &kept, |hand, wire, over| {
+            let mut memories = Vec::new();
+            for session in 0..deaths {
+                let (memory, work) = hand.takes(&format!("s{session}"));
+                assert!(matches!(work, super::Work::Attempt { .. }));
+                memories.push(memory.unwrap());
+                hand.0.killed_for_memory(0, Some("200Mi"));
+            }
+            assert_eq!(memories, [256 << 10, 128 << 10, 64 << 10][..deaths]);
+            if deaths == 2 {
+                let station = cluster.station(wire, 0, "at last", Some(0));
+                std::thread::scope(|scope| {
+                    scope.spawn(|| station.run().unwrap());
+                    wait_for(over);
+                });
+            }
+        });
+        if deaths == 2 {
+            done.unwrap();
+            assert!(cluster.picture(0) == expected(&spec), "the memory changes no byte");
+        } else {
+            let said = done.unwrap_err().to_string();
+            for part in [
+                "256Ki, then 128Ki, then 64Ki of the scene",
+                "may take 200Mi",
+                "the largest split takes",
+                "limits.memory",
+            ] {
+                assert!(said.contains(part), "{part}: {said}");
+            }
+        }
+    }
+}
+
+#[test]
+fn work_that_kills_its_worker_each_time_fails_the_job() {
+    let spec = spec(Strategy::Auto, 4, 1);
+    let (cluster, kept) = (Cluster::new(2), Arc::new(Kept::default()));
+    // whoever prepares needs more memory than there is
+    let done = by_hand(&cluster, &spec, None, &kept, |hand, _, _| {
+        for session in 0..3 {
+            let (_, work) = hand.takes(&format!("s{session}"));
+            assert!(matches!(work, super::Work::Prepare { .. }));
+            hand.0.killed_for_memory(0, Some("1Gi"));
+        }
+    });
+    let said = done.unwrap_err().to_string();
+    assert!(said.contains("preparing the scene: 3 workers were killed") && said.contains("may take 1Gi"), "{said}");
+    // whatever they die of
+    cluster.render(&spec, &kept).unwrap();
+    let scene = kept.prepared.lock().unwrap()[0].0.hash.to_string();
+    for known in [None, Some(scene)] {
+        let what = if known.is_some() { "camera rays of tile" } else { "preparing the scene" };
+        let kept = Arc::new(Kept::default());
+        let done = by_hand(&cluster, &spec, known, &kept, |hand, _, over| {
+            for session in 0..5 {
+                hand.takes(&format!("s{session}"));
+            }
+            // the next process finds that the last one died as well
+            let worker = WorkerId { number: 0, session: "last".into() };
+            let beat = Beat { worker, running: vec![] };
+            hand.0.beat(&beat).unwrap();
+            wait_for(over);
+        });
+        let said = done.unwrap_err().to_string();
+        assert!(said.contains(what) && said.contains("5 times the worker that had it in hand died"), "{said}");
+    }
+}
+
+#[test]
+fn a_scene_that_two_workers_prepare_lies_whole_on_two_stores_and_is_read_by_any_number() {
+    let mut spec = spec(Strategy::SchedulingGridOverlapReduced, 6, 2);
+    spec.workers.nodes = Some(2);
+    let (cluster, kept) = (Cluster::new(6), Arc::new(Kept::default()));
+    // three workers here, of whom the job's spec does not know
+    cluster.render(&spec, &kept).unwrap();
+    let want = expected(&spec);
+    assert!(cluster.picture(0) == want);
+    let reference = kept.prepared.lock().unwrap()[0].0;
+    let part = cluster.depot(None).replicated(2).unwrap();
+    let objects = Arc::new(SceneObjects::new(Arc::new(part), cluster.runtime.handle().clone()).unwrap());
+    let manifest = Manifest::load(objects.as_ref(), &reference).unwrap();
+    assert_eq!(manifest.homes.as_ref().map(Vec::len), Some(2));
+    let lies = |store: usize| -> BTreeSet<String> {
+        let listed = cluster.runtime.block_on(cluster.stores[store].list("objects/")).unwrap();
+        listed.into_iter().map(|(key, _)| key).collect()
+    };
+    let needed = PreparedScene::open(manifest, objects).unwrap();
+    let blocks: BTreeSet<String> = (needed.owning_order().iter().map(|&s| &needed.manifest.splits[s as usize]))
+        .flat_map(|s| [object_key(&s.geometry.hash), object_key(&s.attributes.hash)])
+        .collect();
+    let whole =
+        |a: usize, b: usize| lies(a).union(&lies(b)).filter(|key| blocks.contains(*key)).count() == blocks.len();
+    let pairs = (0..6).flat_map(|a| (a + 1..6).map(move |b| (a, b))).filter(|&(a, b)| whole(a, b)).count();
+    assert!(pairs >= 1, "no two stores hold all {} blocks", blocks.len());
+    let copies: usize = (0..6).map(|s| lies(s).intersection(&blocks).count()).sum();
+    assert_eq!(copies, 2 * blocks.len());
+    // another number of workers finds it there
+    let again = RenderJobSpec { workers: Default::default(), ..spec.clone() };
+    let kept = Arc::new(Kept::default());
+    cluster.beside((&again, &kept, "f"), |job| Job { prefix: "jobs/2".into(), ..job }, |_, _| {}).unwrap();
+    assert_eq!(*kept.prepared.lock().unwrap(), [(reference, true)]);
+    assert!(cluster.picture(1) == want);
+}
+
+#[test]
+fn more_copies_than_servers_are_refused() {
+    let (cluster, kept) = (Cluster::new(2), Arc::new(Kept::default()));
+    let said = cluster.render(&spec(Strategy::Auto, 2, 3), &kept).unwrap_err().to_string();
+    assert!(said.contains("spec.replicas is 3, but the storage has 2 server(s)"), "{said}");
 }

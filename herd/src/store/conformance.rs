@@ -47,13 +47,16 @@ async fn reads_back_what_a_file_held(store: &dyn BlockStore) {
         let key = "conformance/file";
         store.put_file(key, &file).await.unwrap();
         assert!(store.get(key).await.unwrap() == body, "{length}");
-        // over what is there
+        // over what was there, and was longer
         let copy = folder.path().join("copy");
+        std::fs::write(&copy, vec![7; 4 << 20]).unwrap();
         assert_eq!(store.get_file(key, &copy).await.unwrap(), length as u64);
         assert!(std::fs::read(&copy).unwrap() == body, "{length}");
         store.delete(&[key.to_owned()]).await.unwrap();
         assert!(matches!(store.get_file(key, &copy).await, Err(StoreError::NotFound { .. })));
     }
+    let gone = store.get_file("conformance/file", &folder.path().join("copy")).await;
+    assert!(matches!(gone, Err(StoreError::NotFound { .. })), "{gone:?}");
     assert!(store.put_file("conformance/file", &folder.path().join("none")).await.is_err());
 }
 

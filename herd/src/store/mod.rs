@@ -57,8 +57,8 @@ pub trait BlockStore: Send + Sync {
     }
     /// Reads a whole object.
     async fn get(&self, key: &str) -> Result<Bytes, StoreError>;
-    /// Reads a whole object into a file, which is made or written over; its size. Backends for which it matters do not hold it in memory. What it
-    /// holds is not compared with a hash in the key.
+    /// Reads a whole object into a file, which is made or replaced; its size in bytes. Backends for which it matters do not hold it in
+    /// memory. After an error the file holds anything.
     async fn get_file(&self, key: &str, file: &Path) -> Result<u64, StoreError> {
         let body = self.get(key).await?;
         tokio::fs::write(file, &body).await.map_err(|e| unwritable(self.describe(), file, &e))?;
@@ -79,7 +79,7 @@ fn unreadable(store: String, file: &Path, e: &std::io::Error) -> StoreError {
 }
 
 fn unwritable(store: String, file: &Path, e: &std::io::Error) -> StoreError {
-    let message = format!("cannot write {}, where an object is to go: {e}", file.display());
+    let message = format!("cannot write {}: {e}; give it room, or another folder", file.display());
     StoreError::Misconfigured { store, message }
 }
 

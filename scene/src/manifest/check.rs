@@ -1,6 +1,6 @@
 //! What must hold in a manifest before anything uses it.
 
-use std::collections::HashMap;
+use std::collections::{BTreeSet, HashMap};
 
 use super::{Manifest, SplitEntry};
 use crate::grid::Grid;
@@ -12,6 +12,11 @@ impl Manifest {
     /// Checks ranges and relations; the message says which is broken.
     pub(super) fn check(&self) -> Result<(), String> {
         self.settings.check()?;
+        if let Some(homes) = &self.homes
+            && (homes.is_empty() || homes.iter().collect::<BTreeSet<_>>().len() < homes.len())
+        {
+            return Err("its blocks lie on no store, or twice on one".to_owned());
+        }
         if self.offset.iter().any(|x| !x.is_finite()) {
             return Err("the offset is not finite".to_owned());
         }

@@ -56,6 +56,9 @@ pub struct Manifest {
     pub defaults: Defaults,
     /// What was counted.
     pub counts: Counts,
+    /// On a cluster: the stores, by number, on which the first copies of all blocks lie; on all of them without it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub homes: Option<Vec<u32>>,
 }
 
 /// One split.

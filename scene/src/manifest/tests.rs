@@ -64,6 +64,7 @@ pub(crate) fn sample() -> Manifest {
             ..Default::default()
         },
         counts: Counts { records: 10, triangles: 6, spheres: 2, degenerate: 2, ..Default::default() },
+        homes: None,
     }
 }
 
@@ -148,4 +149,15 @@ fn mutated_bytes_are_refused_or_canonical_and_never_panic() {
         }
     });
     assert!(rounds.is_none_or(|n| read > n / 100 && read < n), "{read} of {rounds:?}");
+}
+
+#[test]
+fn homes_are_written_where_there_are_any_and_never_none() {
+    let manifest = sample();
+    assert!(!String::from_utf8(manifest.encode()).unwrap().contains("homes"), "scenes of one machine keep their names");
+    let with = |homes: &[u32]| Manifest::decode(&Manifest { homes: Some(homes.to_vec()), ..sample() }.encode());
+    assert_eq!(with(&[3, 1]).unwrap().homes, Some(vec![3, 1]));
+    for wrong in [&[][..], &[3, 3]] {
+        assert!(with(wrong).unwrap_err().to_string().contains("lie on no store"));
+    }
 }

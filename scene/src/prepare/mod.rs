@@ -248,6 +248,7 @@ pub fn prepare(
         choice,
         defaults,
         counts,
+        homes: None,
     };
     let reference = manifest.store(&store)?;
     let report = PrepareReport::new(&manifest, &store, spool.traffic(), tree);
