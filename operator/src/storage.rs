@@ -7,7 +7,7 @@ use k8s_openapi::api::core::v1::{ConfigMap, Secret};
 use k8s_openapi::api::discovery::v1::EndpointSlice;
 use kube::api::ListParams;
 use kube::{Api, Client};
-use rayherd_api::StorageSpec;
+use rayherd_api::{ByteSize, StorageSpec};
 use rayherd_herd::remote::{Endpoint, Storage};
 use rayherd_herd::store::S3Credentials;
 use serde::Deserialize;
@@ -43,6 +43,9 @@ struct Profile {
     /// Servers by address.
     #[serde(default)]
     endpoints: Vec<Endpoint>,
+    /// Disk beside each worker for copies of what it has read from servers on other machines.
+    #[serde(default)]
+    cache: Option<ByteSize>,
 }
 
 #[derive(Clone, Debug, Deserialize)]
@@ -92,7 +95,8 @@ pub async fn storage(client: &Client, own: &str, spec: &StorageSpec) -> Result<S
         return Err(missing("names no server that is there"));
     }
     let region = profile.region.unwrap_or_else(|| "us-east-1".into());
-    Ok(Storage { bucket: profile.bucket, prefix: profile.prefix, region, endpoints })
+    let cache = profile.cache.map_or(0, ByteSize::bytes);
+    Ok(Storage { bucket: profile.bucket, prefix: profile.prefix, region, endpoints, cache })
 }
 
 /// The servers of a StatefulSet in the order of their numbers, with the nodes that they run on now. One that is away has its place
@@ -146,5 +150,15 @@ mod tests {
         assert_eq!(found[1].url, "http://minio-1.minio.store.svc:9000");
         let nodes: Vec<Option<&str>> = found.iter().map(|e| e.node.as_deref()).collect();
         assert_eq!(nodes, [Some("b"), None, Some("c")]);
+    }
+
+    #[test]
+    fn a_profile_has_a_cache_only_when_it_says_so() {
+        let cache = |more: &str| {
+            let profile = format!("bucket: herd\nendpoints: [{{url: 'https://s3'}}]\n{more}");
+            serde_yaml::from_str::<Profile>(&profile).map(|p| p.cache.map(ByteSize::bytes))
+        };
+        assert_eq!((cache("").unwrap(), cache("cache: 20Gi").unwrap()), (None, Some(20 << 30)));
+        assert!(cache("cache: large").unwrap_err().to_string().contains("is no size"));
     }
 }

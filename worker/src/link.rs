@@ -135,9 +135,16 @@ mod tests {
             worker: WorkerId { number: 0, session: "s".into() },
             slots: 1,
             node: None,
-            storage: Storage { bucket: "b".into(), prefix: String::new(), region: "r".into(), endpoints: vec![] },
+            storage: Storage {
+                bucket: "b".into(),
+                prefix: String::new(),
+                region: "r".into(),
+                endpoints: vec![],
+                cache: 0,
+            },
             credentials: S3Credentials { access_key: String::new(), secret_key: String::new(), session_token: None },
             scratch: "/".into(),
+            cache: None,
             token: token.to_owned(),
             authority,
         }

@@ -9,6 +9,7 @@ pub mod depot;
 pub mod fleet;
 pub mod frames;
 mod guard;
+mod holdings;
 pub mod message;
 mod parts;
 mod prepare;

@@ -48,6 +48,9 @@ pub struct Storage {
     pub region: String,
     /// The servers.
     pub endpoints: Vec<Endpoint>,
+    /// Bytes of a disk beside each worker that keep what it has read from servers on other machines; 0 for none.
+    #[serde(default)]
+    pub cache: u64,
 }
 
 fn default_region() -> String {
