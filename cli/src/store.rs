@@ -11,8 +11,8 @@ use anyhow::Context;
 use clap::Args;
 use rayherd_api::ByteSize;
 use rayherd_herd::store::{
-    BlockStore, Caching, DirectoryStore, Prefixed, RetryPolicy, Retrying, S3Settings, S3Store, SceneObjects, Spilling,
-    StoreError,
+    BlockStore, Caching, Copies, DirectoryStore, Prefixed, RetryPolicy, Retrying, S3Settings, S3Store, SceneObjects,
+    Spilling, StoreError,
 };
 use rayherd_scene::objects::{DirectoryObjects, ObjectStore};
 use tokio::runtime::Runtime;
@@ -68,10 +68,11 @@ impl Store {
             let read: Arc<dyn BlockStore> = match s3.s3_cache {
                 None => blocks.clone(),
                 Some(size) => {
-                    let near = Arc::new(Spilling::new(0, interrupt::remove_at_end));
+                    let near = Spilling::new(0, interrupt::remove_at_end);
+                    let copies = Arc::new(Copies::new(Arc::new(near), size.bytes()));
                     // what is named by its hash never changes
                     let keeps = |key: &str| key.starts_with("objects/");
-                    Arc::new(Caching::new(blocks.clone(), near, size.bytes(), keeps))
+                    Arc::new(Caching::new(blocks.clone(), copies, keeps))
                 }
             };
             let objects = Arc::new(SceneObjects::new(read, runtime.handle().clone())?);

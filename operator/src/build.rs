@@ -30,6 +30,9 @@ const DEFAULT_MEMORY: u64 = 1 << 30;
 /// Memory beside the scene's: the process, and per slot its rays, groups and film.
 const PROCESS_BYTES: u64 = 256 << 20;
 const SLOT_BYTES: u64 = 256 << 20;
+/// Where workers have their caches, and what a folder takes beside the files in it.
+const CACHE: &str = "/cache";
+const FOLDER_BYTES: u64 = 64 << 20;
 /// Longer than a batch of rays and a report take.
 const GRACE_SECONDS: u32 = 30;
 
@@ -79,7 +82,7 @@ pub fn pod(
     let uid = job.metadata.uid.clone().unwrap_or_default();
     let value = |name: &str, value: &str| json!({"name": name, "value": value});
     let field = |name: &str, path: &str| json!({"name": name, "valueFrom": {"fieldRef": {"fieldPath": path}}});
-    let env = vec![
+    let mut env = vec![
         value("RAYHERD_OPERATOR", &config.url),
         value("RAYHERD_CA", trusted),
         value("RAYHERD_JOB", &uid),
@@ -92,6 +95,19 @@ pub fn pod(
         field("RAYHERD_POD", "metadata.name"),
         field("RAYHERD_NODE", "spec.nodeName"),
     ];
+    let (mut requests, mut mounts, mut volumes) = (
+        resources.clone(),
+        vec![json!({"name": "scratch", "mountPath": "/scratch"})],
+        vec![json!({"name": "scratch", "emptyDir": {}})],
+    );
+    if storage.cache > 0 {
+        let size = storage.cache.saturating_add(FOLDER_BYTES).to_string();
+        env.push(value("RAYHERD_CACHE", CACHE));
+        mounts.push(json!({"name": "cache", "mountPath": CACHE}));
+        volumes.push(json!({"name": "cache", "emptyDir": {"sizeLimit": size}}));
+        // no limit: that would be one of the scratch folder too
+        requests["ephemeral-storage"] = json!(size);
+    }
     let mut pod = json!({
         "spec": {
             "enableServiceLinks": false,
@@ -108,15 +124,15 @@ pub fn pod(
             "containers": [{
                 "name": CONTAINER,
                 "image": config.image,
-                "resources": {"requests": resources, "limits": resources},
+                "resources": {"requests": requests, "limits": resources},
                 "securityContext": {
                     "allowPrivilegeEscalation": false,
                     "readOnlyRootFilesystem": true,
                     "capabilities": {"drop": ["ALL"]},
                 },
-                "volumeMounts": [{"name": "scratch", "mountPath": "/scratch"}],
+                "volumeMounts": mounts,
             }],
-            "volumes": [{"name": "scratch", "emptyDir": {}}],
+            "volumes": volumes,
         },
     });
     if storage.service_account.is_none() {
@@ -553,6 +569,42 @@ mod tests {
         }
         // before that is known nobody goes
         assert_eq!(plan("a", &[pod(None, "false")], 1, (&BTreeMap::new(), Placement::Required)), Plan::default());
+    }
+
+    #[test]
+    fn a_cache_is_a_volume_of_its_size_beside_a_root_that_stays_read_only() {
+        let endpoints = vec![Endpoint { url: "https://s3".into(), node: None }];
+        let without = Storage { bucket: "b".into(), region: "r".into(), endpoints, ..Storage::default() };
+        let with = Storage { cache: 20 << 30, ..without.clone() };
+        let made =
+            |job: &RenderJobObject, storage| pod(job, &config(), storage, &BTreeMap::new(), "PEM", 0, "a").unwrap();
+        let (plain, cached) = (made(&job(), &without), made(&job(), &with));
+        let at = |pod: &Value, path: &str| pod.pointer(path).cloned().unwrap_or_default();
+        let env = |pod: &Value, name: &str| {
+            let all = at(pod, "/spec/containers/0/env");
+            all.as_array().unwrap().iter().find(|e| e["name"] == name).map(|e| e["value"].clone())
+        };
+        let size = json!(((20u64 << 30) + (64 << 20)).to_string());
+        assert_eq!(at(&cached, "/spec/volumes/1"), json!({"name": "cache", "emptyDir": {"sizeLimit": size}}));
+        assert_eq!(at(&cached, "/spec/containers/0/volumeMounts/1"), json!({"name": "cache", "mountPath": "/cache"}));
+        assert_eq!(env(&cached, "RAYHERD_CACHE"), Some(json!("/cache")));
+        let told: Storage = serde_json::from_str(env(&cached, "RAYHERD_STORAGE").unwrap().as_str().unwrap()).unwrap();
+        assert_eq!(told.cache, 20 << 30);
+        let resources = |pod: &Value, of: &str| at(pod, &format!("/spec/containers/0/resources/{of}"));
+        assert_eq!(resources(&cached, "requests")["ephemeral-storage"], size);
+        assert_eq!(resources(&cached, "limits"), resources(&plain, "requests"), "as many cores and as much memory");
+        assert_eq!(at(&cached, "/spec/containers/0/securityContext/readOnlyRootFilesystem"), json!(true));
+        serde_json::from_value::<Pod>(cached).unwrap();
+        // nothing of it unless it is asked for
+        let text = plain.to_string();
+        assert!(!text.contains("/cache") && !text.contains("RAYHERD_CACHE") && !text.contains("ephemeral"), "{text}");
+        // another volume in its place, for those who have a fast disk
+        let mut own = job();
+        own.spec.workers.template = Some(json!({"spec": {
+            "volumes": [{"name": "fast", "ephemeral": {}}],
+            "containers": [{"name": "worker", "volumeMounts": [{"name": "fast", "mountPath": "/cache"}]}],
+        }}));
+        assert_eq!(at(&made(&own, &with), "/spec/containers/0/volumeMounts/1/name"), json!("fast"));
     }
 
     #[test]

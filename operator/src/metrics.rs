@@ -43,6 +43,7 @@ pub struct Metrics {
     progress: GaugeVec,
     degraded: GaugeVec,
     error: GaugeVec,
+    cache_failures: GaugeVec,
 }
 
 /// Why the task server refused a request.
@@ -119,6 +120,11 @@ impl Metrics {
             progress: gauge("rayherd_job_progress_ratio", "camera samples made of those asked for", &JOB)?,
             degraded: gauge("rayherd_job_degraded", "1 while there are fewer copies than asked for", &JOB)?,
             error: gauge("rayherd_job_relmse", "estimated relMSE of the last frame that is done", &JOB)?,
+            cache_failures: gauge(
+                "rayherd_job_cache_failures",
+                "copies that the workers' caches could not keep, or have lost",
+                &JOB,
+            )?,
             reconcile_seconds,
             registry,
         })
@@ -152,6 +158,7 @@ impl Metrics {
             self.bytes.with_label_values(&labels).set(row.bytes as f64);
         }
         self.cpu.with_label_values(&labels).set(tally.cpu);
+        self.cache_failures.with_label_values(&labels).set(tally.cache_failures as f64);
         self.rounds.with_label_values(&labels).set(state.status.rounds as f64);
         self.tasks.with_label_values(&labels).set(state.reports.iter().map(|r| r.tasks).sum::<u64>() as f64);
         self.waiting.with_label_values(&labels).set(state.status.waiting as f64);
@@ -183,6 +190,7 @@ impl Metrics {
             &self.progress,
             &self.degraded,
             &self.error,
+            &self.cache_failures,
         ];
         for gauge in gauges {
             // one that was never set has nothing to remove
@@ -256,6 +264,7 @@ mod tests {
         for gauge in [&metrics.wanted, &metrics.slots, &metrics.progress, &metrics.degraded, &metrics.error] {
             gauge.with_label_values(&["n", "j"]).set(1.0);
         }
+        metrics.cache_failures.with_label_values(&["n", "j"]).set(1.0);
         metrics.bytes.with_label_values(&["n", "j", "trace", "read", "geometry", "local"]).set(1.0);
         let shown = metrics.text().unwrap();
         let exist: Vec<&str> = shown.lines().filter_map(|l| l.strip_prefix("# TYPE ")?.split(' ').next()).collect();

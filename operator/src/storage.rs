@@ -7,7 +7,7 @@ use k8s_openapi::api::core::v1::{ConfigMap, Secret};
 use k8s_openapi::api::discovery::v1::EndpointSlice;
 use kube::api::ListParams;
 use kube::{Api, Client};
-use rayherd_api::StorageSpec;
+use rayherd_api::{ByteSize, StorageSpec};
 use rayherd_herd::remote::{Endpoint, Profile, Service, Storage};
 use rayherd_herd::store::{S3Credentials, S3Key};
 
@@ -62,8 +62,9 @@ pub async fn storage(client: &Client, own: &str, spec: &StorageSpec) -> Result<S
         return Err(missing("names no server that is there"));
     }
     let region = profile.region.unwrap_or_else(|| "us-east-1".into());
-    let Profile { bucket, prefix, identity, service_account, .. } = profile;
-    Ok(Storage { bucket, prefix, region, endpoints, identity, service_account })
+    let Profile { bucket, prefix, identity, service_account, cache, .. } = profile;
+    let cache = cache.map_or(0, ByteSize::bytes);
+    Ok(Storage { bucket, prefix, region, endpoints, identity, service_account, cache })
 }
 
 /// Whether the storage has servers on nodes. One that is away just now is on none.
@@ -135,5 +136,15 @@ mod tests {
         let storage = |endpoints| Storage { bucket: "b".into(), region: "r".into(), endpoints, ..Storage::default() };
         assert!(is_local(&storage(found)), "the one that is away makes no other far");
         assert!(!is_local(&storage(vec![Endpoint { url: "https://s3".into(), node: None }])));
+    }
+
+    #[test]
+    fn a_profile_has_a_cache_only_when_it_says_so() {
+        let cache = |more: &str| {
+            let profile = format!("bucket: herd\nendpoints: [{{url: 'https://s3'}}]\n{more}");
+            serde_yaml::from_str::<Profile>(&profile).map(|p| p.cache.map(ByteSize::bytes))
+        };
+        assert_eq!((cache("").unwrap(), cache("cache: 20Gi").unwrap()), (None, Some(20 << 30)));
+        assert!(cache("cache: large").unwrap_err().to_string().contains("is no size"));
     }
 }

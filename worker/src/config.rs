@@ -25,6 +25,8 @@ pub struct Config {
     pub credentials: S3Credentials,
     /// A folder of its own.
     pub scratch: PathBuf,
+    /// Where its cache is, if the storage's profile gives it one.
+    pub cache: Option<PathBuf>,
     /// The token that proves which pod this is; it is renewed in place.
     pub token: PathBuf,
     /// Certificates of the authority that the operator's is signed by, as PEM. No other is trusted.
@@ -69,6 +71,7 @@ impl Config {
             storage,
             credentials,
             scratch: need("RAYHERD_SCRATCH")?.into(),
+            cache: variable("RAYHERD_CACHE").map(PathBuf::from),
             token: need("RAYHERD_TOKEN_FILE")?.into(),
             authority: need("RAYHERD_CA")?,
         })
@@ -106,6 +109,7 @@ mod tests {
         let config = Config::from(|n| full().get(n).map(|v| (*v).to_owned())).unwrap();
         assert_eq!((config.worker.number, config.slots, config.operator.as_str()), (1, 2, "https://operator:8443"));
         assert_eq!(config.storage.depot(config.node.as_deref(), &config.credentials).unwrap().home(), Some(0));
+        assert_eq!((config.cache, config.storage.cache), (None, 0), "as an operator without caches says it");
         for name in full().keys().filter(|n| **n != "RAYHERD_NODE") {
             let error = Config::from(|n| full().get(n).filter(|_| n != *name).map(|v| (*v).to_owned())).err().unwrap();
             assert!(error.to_string().contains(name), "{error}");

@@ -138,6 +138,7 @@ mod tests {
             storage: Storage { bucket: "b".into(), region: "r".into(), ..Storage::default() },
             credentials: S3Key { access_key: String::new(), secret_key: String::new(), session_token: None }.into(),
             scratch: "/".into(),
+            cache: None,
             token: token.to_owned(),
             authority,
         }

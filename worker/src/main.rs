@@ -6,6 +6,7 @@ mod link;
 use std::process::ExitCode;
 
 use rayherd_herd::remote::Station;
+use rayherd_herd::store::Copies;
 use tokio::signal::unix::{SignalKind, signal};
 
 use config::Config;
@@ -29,7 +30,10 @@ fn run() -> anyhow::Result<()> {
     let home = depot.home().map_or_else(|| "none".into(), |h| h.to_string());
     tracing::info!(number = config.worker.number, slots = config.slots, home, "worker begins");
     let link = Http::new(&config)?;
-    let station = Station::new(&link, depot, config.slots, config.worker.clone(), config.scratch.clone())?;
+    let mut station = Station::new(&link, depot, config.slots, config.worker.clone(), config.scratch.clone())?;
+    if let Some(folder) = config.cache.as_ref().filter(|_| config.storage.cache > 0) {
+        station = station.caching(Copies::in_folder(folder, config.storage.cache));
+    }
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
     std::thread::scope(|scope| {
         let work = scope.spawn(|| station.run());

@@ -11,7 +11,7 @@ use rayherd_api::ByteSize;
 use tokio::sync::Notify;
 
 use super::deaths::{Deaths, Held, MOST_DEATHS, MOST_KILLED, Verdict, keys};
-use super::message::{Answer, Beat, Done, Failure, Poll, Report, Stage, Work, WorkerId};
+use super::message::{Answer, Beat, Done, Failure, Holds, Poll, Report, Stage, Work, WorkerId};
 use crate::driver::{Event, Executor, Finished, Launch};
 use crate::job::JobError;
 use crate::ledger::TaskId;
@@ -64,6 +64,7 @@ struct State {
     failing: Option<Instant>,
     bytes: Bytes,
     cpu: f64,
+    cache_failures: u64,
     /// Splits and texture tiles that somebody has read in this stage.
     read: [BTreeSet<u32>; 2],
     first_attempt: Option<Instant>,
@@ -82,6 +83,17 @@ struct Worker {
     open: bool,
     /// It can take a band out of a film part.
     bands: bool,
+    /// What its cache holds of the current stage's scene.
+    holds: Holds,
+}
+
+impl Worker {
+    /// What was told later counts, in whatever order it came.
+    fn told(&mut self, holds: Option<&Holds>) {
+        if let Some(holds) = holds.filter(|h| h.version > self.holds.version) {
+            self.holds = holds.clone();
+        }
+    }
 }
 
 struct Doing {
@@ -104,6 +116,8 @@ pub struct Tally {
     pub bytes: Bytes,
     /// CPU-seconds of all work.
     pub cpu: f64,
+    /// Copies that workers' caches could not keep, or have lost.
+    pub cache_failures: u64,
     /// When the first attempt was handed out.
     pub first_attempt: Option<Instant>,
 }
@@ -132,7 +146,10 @@ impl Fleet {
         state.read = Default::default();
         state.stage = Some(stage);
         state.emptied.clear();
-        state.workers.iter_mut().flatten().for_each(|w| w.open = false);
+        for worker in state.workers.iter_mut().flatten() {
+            // the splits of another scene may have these numbers now
+            (worker.open, worker.holds) = (false, Holds::default());
+        }
         self.wanted.notify_waiters();
     }
     /// The job is over: workers end.
@@ -161,7 +178,8 @@ impl Fleet {
     pub fn tally(&self) -> Tally {
         let state = self.lock();
         let ready = state.workers.iter().flatten().filter(|w| w.seen.elapsed() < SILENCE).count() as u32;
-        Tally { ready, bytes: state.bytes.clone(), cpu: state.cpu, first_attempt: state.first_attempt }
+        let State { cpu, cache_failures, first_attempt, .. } = *state;
+        Tally { ready, bytes: state.bytes.clone(), cpu, cache_failures, first_attempt }
     }
     /// How many of the splits and of the texture tiles nobody has read since the stage began, of so many.
     pub fn never_read(&self, all: [usize; 2]) -> [u64; 2] {
@@ -272,6 +290,7 @@ impl Fleet {
         let worker = state.workers[poll.worker.number as usize].as_mut().ok_or(Unknown)?;
         worker.open |= in_stage;
         worker.bands = poll.bands;
+        worker.told(poll.holds.as_ref());
         let can = |work: &Work| poll.bands || !matches!(work, Work::Merge { band: Some(_), .. });
         let first = state.common.iter().position(|(_, work)| can(work));
         let (what, work) = if let Some((call, work)) = first.and_then(|at| state.common.remove(at)) {
@@ -306,6 +325,7 @@ impl Fleet {
         report.bytes.iter().for_each(|r| bytes.add(r.stage, r.op, r.kind, r.place, r.bytes));
         state.bytes.merge(&bytes);
         state.cpu += report.cpu;
+        state.cache_failures += report.cache_failures;
         if !matches!(report.result, Err(Failure::Stopped)) {
             state.deaths.came_out(report.worker.number, &doing.held.keys);
         }
@@ -313,6 +333,9 @@ impl Fleet {
         if state.stage.is_some() && report.reads.stage.split('+').next() == Some(&state.whole.0) {
             state.read[0].extend(report.reads.splits);
             state.read[1].extend(report.reads.tiles);
+            if let Some(worker) = state.workers[report.worker.number as usize].as_mut() {
+                worker.told(report.holds.as_ref());
+            }
         }
         match (doing.what, report.result) {
             (What::Attempt { task, number, .. }, result) => {
@@ -518,8 +541,8 @@ impl State {
                 ));
             }
             let (session, seen) = (worker.session.clone(), Instant::now());
-            self.workers[number] =
-                Some(Worker { session, home, seen, ready: VecDeque::new(), open: false, bands: true });
+            let (ready, holds) = (VecDeque::new(), Holds::default());
+            self.workers[number] = Some(Worker { session, home, seen, ready, open: false, bands: true, holds });
         }
         if let Some(w) = &mut self.workers[number] {
             w.seen = Instant::now();
@@ -617,7 +640,20 @@ impl Executor for Fleet {
             let near = |&w: &u32| homes[w as usize].is_some_and(|home| on.contains(&home));
             (0..homes.len() as u32).filter(near).collect()
         };
-        Some(state.placement.iter().map(near).collect())
+        let mut holders: Vec<Vec<u32>> = state.placement.iter().map(near).collect();
+        // where nobody looks where data lies, caches do not count either
+        if state.stage.as_ref().is_some_and(|s| s.near) {
+            let count = holders.len();
+            for (number, worker) in (0..).zip(&state.workers) {
+                let held = worker.iter().flat_map(|w| w.holds.splits(count));
+                held.for_each(|split| holders[split].push(number));
+            }
+            for on in &mut holders {
+                on.sort_unstable();
+                on.dedup();
+            }
+        }
+        Some(holders)
     }
     fn memory(&self) -> Option<u64> {
         self.lock().memory()

@@ -37,6 +37,19 @@ pub struct Poll {
     /// It can take a band out of a film part; workers of earlier versions add all of it.
     #[serde(default)]
     pub bands: bool,
+    /// What its cache holds of the stage's scene, if it has one.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub holds: Option<Holds>,
+}
+
+/// Splits that lie in a worker's cache.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "camelCase")]
+pub struct Holds {
+    /// Grows with each change, from 0 when it holds nothing: of two messages of one session the higher one is the later.
+    pub version: u64,
+    /// First and last of each run of splits, ascending.
+    pub splits: Vec<[u32; 2]>,
 }
 
 /// What it is told.
@@ -154,6 +167,12 @@ pub struct Report {
     /// What this worker has read of the scene for the first time.
     #[serde(default)]
     pub reads: Reads,
+    /// What its cache holds of the scene of the stage that `reads` names, if it has one.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub holds: Option<Holds>,
+    /// Copies that its cache could not keep, or has lost, since it told last.
+    #[serde(default)]
+    pub cache_failures: u64,
 }
 
 /// Objects of a scene that a worker has read in a stage, and has not told of before.

@@ -10,6 +10,7 @@ pub mod depot;
 pub mod fleet;
 pub mod frames;
 mod guard;
+mod holdings;
 mod homes;
 pub mod message;
 mod parts;

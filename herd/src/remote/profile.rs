@@ -1,5 +1,6 @@
 //! Storage profiles: what a cluster's administrator writes down of a storage, and a job names.
 
+use rayherd_api::ByteSize;
 use serde::Deserialize;
 
 use super::Endpoint;
@@ -32,6 +33,9 @@ pub struct Profile {
     /// The service account that workers run as, in the job's namespace.
     #[serde(default)]
     pub service_account: Option<String>,
+    /// Disk beside each worker for copies of what it has read from servers on other machines.
+    #[serde(default)]
+    pub cache: Option<ByteSize>,
 }
 
 /// Servers by a headless service.

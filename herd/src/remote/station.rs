@@ -15,8 +15,9 @@ use tokio::runtime::Runtime;
 
 use super::Depot;
 use super::bands::Adder;
+use super::holdings::Holdings;
 use super::homes::Homes;
-use super::message::{Answer, Beat, Done, Failure, Poll, Reads, Report, Stage, Work, WorkerId};
+use super::message::{Answer, Beat, Done, Failure, Holds, Poll, Reads, Report, Stage, Work, WorkerId};
 use super::prepare::prepare_scene;
 use crate::job::spec::definition;
 use crate::job::{JobError, JobSettings, NodeSpec, PreparedScene};
@@ -26,7 +27,7 @@ use crate::local::nodes::{Fetch, Nodes, Part};
 use crate::local::slots::StopFlag;
 use crate::local::usage::thread_cpu;
 use crate::report::{Bytes, Kind, Place};
-use crate::store::{SceneObjects, StoreError, object_key};
+use crate::store::{BlockStore, Caching, Copies, SceneObjects, StoreError, object_key, promised_hash};
 use crate::task::{Stop, codec};
 
 /// Between two signs of life.
@@ -63,12 +64,21 @@ pub struct Station<'l> {
     slots: u32,
     worker: WorkerId,
     scratch: PathBuf,
+    /// Of what lies on no store at home.
+    copies: Option<Arc<Copies>>,
     runtime: Runtime,
     running: Mutex<BTreeMap<String, StopFlag>>,
     leaving: AtomicBool,
     panicked: AtomicBool,
     /// Pieces of work in a row that did not come out for now.
     failures: AtomicU32,
+}
+
+/// A stage that is open.
+struct Opened<'s> {
+    stage: &'s Stage,
+    shared: Shared<'s>,
+    holdings: Option<Holdings>,
 }
 
 /// What comes after a stage.
@@ -94,7 +104,14 @@ impl<'l> Station<'l> {
         let (running, leaving, panicked) = (Mutex::default(), AtomicBool::new(false), AtomicBool::new(false));
         let failures = AtomicU32::new(0);
         let slots = slots.max(1);
-        Ok(Station { link, depot, slots, worker, scratch, runtime, running, leaving, panicked, failures })
+        let copies = None;
+        Ok(Station { link, depot, slots, worker, scratch, copies, runtime, running, leaving, panicked, failures })
+    }
+
+    /// The same; what is read of scenes from other machines is kept in a cache, and the operator told of it.
+    #[must_use]
+    pub fn caching(self, copies: Copies) -> Self {
+        Station { copies: Some(Arc::new(copies)), ..self }
     }
 
     /// Works until the job is over, or [`Station::leave`] was called.
@@ -165,7 +182,7 @@ impl<'l> Station<'l> {
         let mut stage: Option<Box<Stage>> = None;
         while !self.is_leaving() {
             let next = match &stage {
-                None => self.slots(None, None),
+                None => self.slots(None),
                 Some(stage) => self.in_stage(stage)?,
             };
             match next {
@@ -208,20 +225,24 @@ impl<'l> Station<'l> {
             film: FilmUse::Banded { band: stage.band, most: TILES },
             buckets: stage.buckets,
         };
-        Ok(self.slots(Some(stage), Some(&shared)))
+        let holdings = self.copies.clone().map(|copies| Holdings::new(&scene.manifest, copies));
+        Ok(self.slots(Some(&Opened { stage, shared, holdings })))
     }
 
     fn open(&self, stage: &Stage) -> Result<PreparedScene, JobError> {
-        let store = self.depot.replicated(stage.replicas)?;
-        let objects: Arc<dyn ObjectStore> =
-            Arc::new(SceneObjects::new(Arc::new(store), self.runtime.handle().clone())?);
+        let mut store: Arc<dyn BlockStore> = Arc::new(self.depot.replicated(stage.replicas)?);
+        if let Some(copies) = self.copies.clone().filter(|_| self.depot.home().is_none()) {
+            // what is named by its hash never changes
+            store = Arc::new(Caching::new(store, copies, |key| promised_hash(key).is_some()));
+        }
+        let objects: Arc<dyn ObjectStore> = Arc::new(SceneObjects::new(store, self.runtime.handle().clone())?);
         PreparedScene::open(Manifest::load(objects.as_ref(), &stage.scene)?, objects)
     }
 
     /// Runs all slots, and a clerk, until one is told of another stage, as then all are.
-    fn slots(&self, stage: Option<&Stage>, shared: Option<&Shared>) -> Next {
+    fn slots(&self, open: Option<&Opened>) -> Next {
         std::thread::scope(|scope| {
-            let slot = |n| move || self.guarded("asking for work", || self.slot(stage, shared, n == self.slots));
+            let slot = |n| move || self.guarded("asking for work", || self.slot(open, n == self.slots));
             let threads: Vec<_> = (0..=self.slots).map(|n| scope.spawn(slot(n))).collect();
             let mut next = Next::Over;
             for thread in threads {
@@ -234,13 +255,19 @@ impl<'l> Station<'l> {
         })
     }
 
-    fn slot(&self, stage: Option<&Stage>, shared: Option<&Shared>, clerk: bool) -> Next {
-        let worker = self.worker.clone();
-        let poll = Poll { worker, home: self.depot.home(), stage: stage.map(|s| s.id.clone()), clerk, bands: true };
+    fn slot(&self, open: Option<&Opened>, clerk: bool) -> Next {
         while !self.is_leaving() {
+            let poll = Poll {
+                worker: self.worker.clone(),
+                home: self.depot.home(),
+                stage: open.map(|o| o.stage.id.clone()),
+                clerk,
+                bands: true,
+                holds: open.and_then(Opened::holds),
+            };
             match self.link.poll(&poll) {
                 Ok(Answer::Wait) => {}
-                Ok(Answer::Work { id, work }) => self.work(id, &work, stage, shared),
+                Ok(Answer::Work { id, work }) => self.work(id, &work, open),
                 Ok(Answer::Open { stage }) => return Next::Open(stage),
                 Ok(Answer::Over) => return Next::Over,
                 Err(e) => {
@@ -252,14 +279,14 @@ impl<'l> Station<'l> {
         Next::Over
     }
 
-    fn work(&self, id: String, work: &Work, stage: Option<&Stage>, shared: Option<&Shared>) {
+    fn work(&self, id: String, work: &Work, open: Option<&Opened>) {
         let stop = StopFlag::default();
         self.lock().insert(id.clone(), stop.clone());
         if self.is_leaving() {
             stop.set();
         }
         let before = thread_cpu();
-        let result = catch_unwind(AssertUnwindSafe(|| self.done(work, stage, shared, &stop)))
+        let result = catch_unwind(AssertUnwindSafe(|| self.done(work, open, &stop)))
             .unwrap_or_else(|_| Err(JobError::Internal("a task panicked".into())));
         let cpu = thread_cpu() - before;
         let result = result.map_err(|e| {
@@ -272,10 +299,12 @@ impl<'l> Station<'l> {
             failure
         });
         let rest = self.rest(&result);
-        let bytes = shared.map_or_else(Bytes::default, |s| s.nodes.take_bytes()).rows();
-        let (splits, tiles) = shared.map(|s| s.nodes.take_reads()).unwrap_or_default();
-        let reads = Reads { stage: stage.map(|s| s.id.clone()).unwrap_or_default(), splits, tiles };
-        let report = Report { worker: self.worker.clone(), id: id.clone(), result, cpu, bytes, reads };
+        let bytes = open.map_or_else(Bytes::default, |o| o.shared.nodes.take_bytes()).rows();
+        let (splits, tiles) = open.map(|o| o.shared.nodes.take_reads()).unwrap_or_default();
+        let reads = Reads { stage: open.map(|o| o.stage.id.clone()).unwrap_or_default(), splits, tiles };
+        let cache_failures = self.copies.as_ref().map_or(0, |c| c.take_failures());
+        let (worker, holds) = (self.worker.clone(), open.and_then(Opened::holds));
+        let report = Report { worker, id: id.clone(), result, cpu, bytes, reads, holds, cache_failures };
         let since = Instant::now();
         while let Err(e) = self.link.report(&report) {
             tracing::warn!("{e}");
@@ -306,14 +335,9 @@ impl<'l> Station<'l> {
         Duration::ZERO
     }
 
-    fn done(
-        &self,
-        work: &Work,
-        stage: Option<&Stage>,
-        shared: Option<&Shared>,
-        stop: &StopFlag,
-    ) -> Result<Done, JobError> {
-        let open = || stage.zip(shared).ok_or_else(|| JobError::Internal("work of a stage that is not open".into()));
+    fn done(&self, work: &Work, open: Option<&Opened>, stop: &StopFlag) -> Result<Done, JobError> {
+        let not_open = || JobError::Internal("work of a stage that is not open".into());
+        let open = || open.map(|o| (o.stage, &o.shared)).ok_or_else(not_open);
         match work {
             Work::Prepare { spec, replicas } => {
                 let (scene, reused, cells_passed) =
@@ -439,6 +463,12 @@ impl<'l> Station<'l> {
     }
 }
 
+impl Opened<'_> {
+    fn holds(&self) -> Option<Holds> {
+        self.holdings.as_ref().map(Holdings::now)
+    }
+}
+
 /// What came out of adding up. The mean is for operators that know no bands.
 fn merged(
     adder: &Adder,
@@ -450,7 +480,7 @@ fn merged(
     Done::Merged { film, rel_mse: error.map(|e| e.mean(adder.layout.size)), error, non_finite, picture }
 }
 
-/// Reads blocks from the store at home first, then from where they belong, then from anywhere.
+/// Reads blocks from the cache and the store at home first, then from where they belong, then from anywhere.
 struct Near<'s, 'l> {
     station: &'s Station<'l>,
     homes: Homes,
@@ -460,7 +490,12 @@ struct Near<'s, 'l> {
 
 impl Fetch for Near<'_, '_> {
     fn fetch(&self, part: Part, object: &ObjectRef) -> Result<(Vec<u8>, Place), JobError> {
-        let depot = &self.station.depot;
+        let Station { depot, copies, runtime, .. } = self.station;
+        let key = object_key(&object.hash);
+        // nothing is kept there that is not what this key promises, and it is checked again
+        if let Some(body) = copies.as_ref().and_then(|c| runtime.block_on(c.get(&key))) {
+            return Ok((body.into(), Place::Local));
+        }
         let (home, first) = (depot.home(), self.home);
         let mut holders = match part {
             Part::Split(n) => self.homes.splits()[n as usize].clone(),
@@ -474,15 +509,17 @@ impl Fetch for Near<'_, '_> {
         let holders = holders.into_iter().filter(|&h| Some(h) != first);
         let mut order: Vec<u32> = first.into_iter().chain(holders).collect();
         order.extend((0..depot.len()).filter(|n| !order.contains(n)).collect::<Vec<u32>>());
-        let key = object_key(&object.hash);
         let mut error = None;
         for number in order {
             let store = &depot.stores()[number as usize];
-            let why = match self.station.runtime.block_on(store.get(&key)) {
+            let why = match runtime.block_on(store.get(&key)) {
                 Ok(body) => match object.verify(&body) {
+                    Ok(()) if Some(number) == home => return Ok((body.into(), Place::Local)),
                     Ok(()) => {
-                        let place = if Some(number) == home { Place::Local } else { Place::Remote };
-                        return Ok((body.into(), place));
+                        if let Some(copies) = copies {
+                            runtime.block_on(copies.keep(&key, &body));
+                        }
+                        return Ok((body.into(), Place::Remote));
                     }
                     Err(message) => StoreError::Corrupt { store: store.describe(), key: key.clone(), message },
                 },

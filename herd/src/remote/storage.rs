@@ -54,6 +54,9 @@ pub struct Storage {
     /// The service account that workers run as, for that; the namespace's default one if none.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub service_account: Option<String>,
+    /// Bytes of a disk beside each worker that keep what it has read from servers on other machines; 0 for none.
+    #[serde(default)]
+    pub cache: u64,
 }
 
 fn default_region() -> String {

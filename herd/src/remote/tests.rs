@@ -1,5 +1,7 @@
 //! Whole jobs over stores in memory: operator and workers in this process, the messages as they would go over the wire.
 
+mod cached;
+
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::atomic::{AtomicU32, Ordering};
 use std::sync::{Arc, LazyLock, Mutex};
@@ -321,7 +323,7 @@ fn a_job_without_workers_keeps_no_other_from_preparing_their_scene() {
         let waits = scope.spawn(move || run(&cluster.job(spec, depot, first, "f"), &keeper, &Silent));
         // nor one whose worker was there, and is gone with the work in its hands
         let gone = WorkerId { number: 0, session: "gone".into() };
-        let poll = Poll { worker: gone.clone(), home: None, stage: None, clerk: false, bands: true };
+        let poll = Poll { worker: gone.clone(), home: None, stage: None, clerk: false, bands: true, holds: None };
         wait_for(|| matches!(first.answer(&poll), Ok(Answer::Work { .. })));
         first.gone(&gone);
         cluster.render(spec, &kept).unwrap();
@@ -470,6 +472,7 @@ fn a_worker_that_comes_back_under_another_session_loses_only_its_tasks() {
         stage: None,
         clerk: false,
         bands: true,
+        holds: None,
     };
     assert_eq!(fleet.answer(&poll("a")), Ok(Answer::Wait));
     let stranger = Poll { worker: WorkerId { number: 1, session: "a".into() }, ..poll("a") };
@@ -503,6 +506,8 @@ fn a_worker_that_comes_back_under_another_session_loses_only_its_tasks() {
             cpu: 0.0,
             bytes: vec![],
             reads: Default::default(),
+            holds: None,
+            cache_failures: 0,
         };
         assert_eq!(fleet.report(report("b", &first, Some(1.0))), Ok(false), "its id is known no more");
         assert_eq!(fleet.report(report("b", "other-0", Some(2.0))), Ok(false));
@@ -525,7 +530,8 @@ fn a_worker_that_knows_no_bands_is_given_none() {
     let fleet = Fleet::new(2, "e");
     let poll = |number: u32, bands: bool| {
         let worker = WorkerId { number, session: "a".into() };
-        let text = serde_json::to_value(Poll { worker, home: None, stage: None, clerk: false, bands }).unwrap();
+        let text =
+            serde_json::to_value(Poll { worker, home: None, stage: None, clerk: false, bands, holds: None }).unwrap();
         // as it is written where the word is not known
         let serde_json::Value::Object(mut map) = text else { unreachable!() };
         if !bands {
@@ -665,7 +671,7 @@ fn workers_that_wait_are_sent_to_the_next_fleet_at_once() {
     let runtime = Runtime::new().unwrap();
     let fleet = Fleet::new(1, "e");
     let worker = WorkerId { number: 0, session: "a".into() };
-    let poll = Poll { worker, home: None, stage: None, clerk: false, bands: true };
+    let poll = Poll { worker, home: None, stage: None, clerk: false, bands: true, holds: None };
     // far longer than a test may take
     let waits = runtime.block_on(async {
         let waiting = fleet.poll(&poll, Duration::from_secs(3600));
@@ -688,7 +694,7 @@ impl Hand<'_> {
         let since = Instant::now();
         loop {
             let worker = WorkerId { number: 0, session: session.into() };
-            let poll = Poll { worker, home: None, stage: stage.clone(), clerk: false, bands: true };
+            let poll = Poll { worker, home: None, stage: stage.clone(), clerk: false, bands: true, holds: None };
             match self.0.answer(&poll).unwrap() {
                 Answer::Open { stage: now } => (memory, stage) = now.map_or((None, None), |s| (s.memory, Some(s.id))),
                 Answer::Work { work, .. } => return (memory, *work),

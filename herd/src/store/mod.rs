@@ -3,6 +3,7 @@
 mod caching;
 #[cfg(any(test, feature = "testing"))]
 pub mod conformance;
+mod copies;
 mod counting;
 mod directory;
 mod faulty;
@@ -25,12 +26,13 @@ use async_trait::async_trait;
 use bytes::Bytes;
 
 pub use caching::{CacheCounts, Caching};
+pub use copies::Copies;
 pub use counting::{Counters, Counting, kind_of_key};
 pub use directory::DirectoryStore;
 pub use faulty::{FaultPlan, Faulty, Injected};
 pub use key::{check_key, check_prefix};
 pub use memory::MemoryStore;
-pub use objects::{SceneObjects, object_is_users, object_key};
+pub use objects::{SceneObjects, object_is_users, object_key, promised_hash};
 pub use prefixed::Prefixed;
 pub use replicated::{NodeView, Replicated, ReplicationCounts, Verify};
 pub use retrying::{RetryPolicy, Retrying};

@@ -43,6 +43,11 @@ pub fn object_key(hash: &ObjectHash) -> String {
     format!("objects/{}/{hex}", &hex[..2])
 }
 
+/// The hash that a key of [`object_key`] promises of its body; none for other keys.
+pub fn promised_hash(key: &str) -> Option<ObjectHash> {
+    key.strip_prefix("objects/")?.split_once('/')?.1.parse().ok()
+}
+
 impl SceneObjects {
     /// Over a store whose calls run on `runtime`, which must have threads of its own.
     pub fn new(store: Arc<dyn BlockStore>, runtime: Handle) -> Result<Self, StoreError> {

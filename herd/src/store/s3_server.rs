@@ -67,6 +67,8 @@ struct State {
     faults: Mutex<S3Faults>,
     requests: AtomicU64,
     injected: AtomicU64,
+    /// By key: how often its object was read.
+    reads: Mutex<BTreeMap<String, u64>>,
 }
 
 impl S3Server {
@@ -115,6 +117,12 @@ impl S3Server {
     pub fn uploads(&self) -> (u64, Vec<String>) {
         let unfinished = lock(&self.state.uploads).values().map(|(key, _)| key.clone()).collect();
         (self.state.parts.load(Ordering::Relaxed), unfinished)
+    }
+
+    /// How often each object whose key begins so was read.
+    pub fn reads(&self, prefix: &str) -> BTreeMap<String, u64> {
+        let reads = lock(&self.state.reads);
+        reads.iter().filter(|r| r.0.starts_with(prefix)).map(|(key, &n)| (key.clone(), n)).collect()
     }
 
     /// Puts an object past every rule, as another program would.
@@ -350,6 +358,7 @@ impl S3 for Buckets {
     async fn get_object(&self, request: S3Request<GetObjectInput>) -> S3Result<S3Response<GetObjectOutput>> {
         let body = self.objects(&request.input.bucket)?.get(&request.input.key).cloned();
         let body = body.ok_or_else(|| s3_error!(NoSuchKey))?;
+        *lock(&self.0.reads).entry(request.input.key.clone()).or_default() += 1;
         let length = body.len() as i64;
         // in parts, as a network would
         let parts: Vec<Bytes> =
