@@ -12,7 +12,6 @@ pub mod forest;
 mod ids;
 mod layout;
 mod order;
-mod parts;
 mod regions;
 mod sah;
 mod top;
