@@ -80,7 +80,7 @@ mod tests {
 
     #[test]
     fn a_worker_whose_pods_fail_waits_and_the_others_do_not() {
-        let at = |second| Timestamp::from_second(1_800_000_000 + second).unwrap();
+        let at = |second: i64| Timestamp::from_second(1_800_000_000 + second).unwrap();
         let mut rests = Rests::default();
         for _ in 0..4 {
             rests.failed(1, "j", Duration::from_secs(1), at(0));
