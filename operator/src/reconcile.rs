@@ -143,7 +143,15 @@ fn api(action: &'static str) -> impl Fn(kube::Error) -> Error {
 pub fn failed(job: Arc<Seen>, error: &Error, context: Arc<Context>) -> Action {
     context.metrics.errors.inc();
     tracing::warn!(job = %job.name_any(), "{error}");
-    Action::requeue(context.failures.failed(job.meta().uid.as_deref().unwrap_or_default(), FAILED))
+    let rest = context.failures.failed(job.meta().uid.as_deref().unwrap_or_default(), FAILED);
+    let is_away = match error {
+        Error::Api { source, .. } | Error::Storage(StorageError::Api { source, .. }) => {
+            !matches!(source, kube::Error::Api(_))
+        }
+        _ => false,
+    };
+    // all wait for the same, and are to go on soon after it is back; never more than 10 s, and still not all at once
+    Action::requeue(if is_away { rest.min(FAILED + rest / 20) } else { rest })
 }
 
 /// One step.

@@ -70,8 +70,8 @@ pub fn gathered(sizes: &[u64], ranked: &[u32], homes: u32, replicas: u32) -> Vec
         load[on[i][0] as usize] += size;
     }
     let others = nodes - homes;
-    if others >= more * homes {
-        for (on, piece) in on.iter_mut().zip(holders(sizes, others, more)).filter(|_| more > 0) {
+    if more > 0 && others >= more * homes {
+        for (on, piece) in on.iter_mut().zip(holders(sizes, others, more)) {
             on.extend(piece.into_iter().map(|p| homes + p));
         }
     } else {
