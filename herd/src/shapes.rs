@@ -2,11 +2,8 @@
 
 use rayherd_render::memory::prefetch;
 
-/// Runs of a shape that are searched rather than looked up one by one: their starts stay in the first cache, where a number per
-/// primitive misses the last one at each hit.
-const RUNS: usize = 256;
-
-/// Shapes by primitive. They take no more memory than a number each: runs of shapes, or these numbers when they are fewer bytes.
+/// Shapes by primitive: by runs, whose tables stay in near caches where a number each misses the last one at each hit; or a number each
+/// when these are fewer bytes.
 pub(crate) enum Shapes {
     /// One by one.
     Each(Vec<u32>),
@@ -29,7 +26,7 @@ impl Shapes {
     pub(crate) fn new(each: Vec<u32>) -> Shapes {
         let count = each.chunk_by(|a, b| a == b).count();
         // two numbers a run and a quarter of one for each primitive
-        if count > RUNS && 8 * count > 3 * each.len() {
+        if 2 * count + each.len().div_ceil(4) > each.len() {
             return Shapes::Each(each);
         }
         let (mut starts, mut shapes) = (Vec::with_capacity(count.saturating_sub(1)), Vec::with_capacity(count));
@@ -89,15 +86,24 @@ mod tests {
         let runs = |runs: usize, length: usize| (0..runs * length).map(|i| (i / length % 7) as u32).collect::<Vec<_>>();
         // runs of very different length: many of one part, many parts of one
         let uneven: Vec<u32> = (0..600).flat_map(|i| vec![i % 5; if i % 100 == 0 { 5000 } else { 4 }]).collect();
-        let kinds =
-            [vec![], vec![5], vec![1, 1, 2], runs(RUNS, 3), runs(RUNS + 1, 1), runs(1000, 2), runs(1000, 9), uneven];
+        let kinds = [
+            vec![],
+            vec![5],
+            vec![1, 1, 2],
+            runs(3, 3),
+            runs(256, 3),
+            runs(257, 1),
+            runs(1000, 2),
+            runs(1000, 9),
+            uneven,
+        ];
         for each in kinds {
             let shapes = Shapes::new(each.clone());
             for (i, shape) in each.iter().enumerate() {
                 shapes.foresee(i);
                 assert_eq!(shapes.get(i), *shape, "{i} of {}", each.len());
             }
-            assert!(shapes.bytes() <= 4 * each.len().max(4 * RUNS), "{} bytes for {}", shapes.bytes(), each.len());
+            assert!(shapes.bytes() <= 4 * each.len(), "{} bytes for {}", shapes.bytes(), each.len());
         }
     }
 }
