@@ -188,10 +188,7 @@ mod tests {
     #[test]
     fn progress_says_how_much_how_fast_and_how_long() {
         assert_eq!(said(0, 4 << 30, Duration::ZERO), "0 B of 4.0 GiB  0 B/s");
-        assert_eq!(
-            said(1 << 30, 4 << 30, Duration::from_secs(64)),
-            "1.0 GiB of 4.0 GiB  16.0 MiB/s  3 min 12 s left"
-        );
+        assert_eq!(said(1 << 30, 4 << 30, Duration::from_secs(64)), "1.0 GiB of 4.0 GiB  16.0 MiB/s  3 min 12 s left");
         assert_eq!(said(10, 10, Duration::from_secs(1)), "10 B of 10 B  10 B/s  0 s left");
     }
 

@@ -367,7 +367,7 @@ fn a_clouds_identity_is_used_where_there_is_no_key() {
         "<AssumeRoleWithWebIdentityResponse xmlns=\"https://sts.amazonaws.com/doc/2011-06-15/\"><AssumeRoleWithWebIdentityResult>\
          <Credentials><AccessKeyId>{id}</AccessKeyId><SecretAccessKey>{secret}</SecretAccessKey><SessionToken>passing</SessionToken>\
          <Expiration>2100-01-01T00:00:00Z</Expiration></Credentials>\
-         <AssumedRoleUser><AssumedRoleId>a:b</AssumedRoleId><Arn>arn:x</Arn></AssumedRoleUser>\
+         <AssumedRoleUser><AssumedRoleId>a:b</AssumedRoleId><Arn>arn:aws:sts::1:assumed-role/herd/s</Arn></AssumedRoleUser>\
          </AssumeRoleWithWebIdentityResult></AssumeRoleWithWebIdentityResponse>"
     );
     let (sts, asked_sts) = answering("200 OK", sts);
