@@ -53,6 +53,9 @@ struct State {
     failing: Option<Instant>,
     bytes: Bytes,
     cpu: f64,
+    hops: u64,
+    outcomes: BTreeMap<Outcome, u64>,
+    by_worker: BTreeMap<u32, WorkerTally>,
     /// Splits and texture tiles that somebody has read in this stage.
     read: [BTreeSet<u32>; 2],
     first_attempt: Option<Instant>,
@@ -83,6 +86,55 @@ enum What {
     Call { call: u64, work: Work },
 }
 
+/// How an attempt at a task ended.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Outcome {
+    /// With a result.
+    Made,
+    /// It was given back, or another one had done the task.
+    Stopped,
+    /// Its worker went away.
+    Gone,
+    /// What it was to work on was lost.
+    Lost,
+    /// It failed.
+    Failed,
+}
+
+impl Outcome {
+    /// All of them.
+    pub const ALL: [Outcome; 5] = [Outcome::Made, Outcome::Stopped, Outcome::Gone, Outcome::Lost, Outcome::Failed];
+
+    /// Its name in metrics.
+    pub fn name(self) -> &'static str {
+        match self {
+            Outcome::Made => "made",
+            Outcome::Stopped => "stopped",
+            Outcome::Gone => "gone",
+            Outcome::Lost => "lost",
+            Outcome::Failed => "failed",
+        }
+    }
+
+    fn of(result: &Result<Done, Failure>) -> Self {
+        match result {
+            Ok(_) => Outcome::Made,
+            Err(Failure::Stopped) => Outcome::Stopped,
+            Err(Failure::Lost { .. }) => Outcome::Lost,
+            Err(Failure::ForNow { .. } | Failure::ForGood { .. }) => Outcome::Failed,
+        }
+    }
+}
+
+/// What one worker has done so far.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct WorkerTally {
+    /// CPU-seconds of its work.
+    pub cpu: f64,
+    /// Bytes of scene data that it held in memory when it reported last.
+    pub resident: u64,
+}
+
 /// What a fleet has done so far, for the status of its job.
 #[derive(Clone, Debug, Default)]
 pub struct Tally {
@@ -92,6 +144,16 @@ pub struct Tally {
     pub bytes: Bytes,
     /// CPU-seconds of all work.
     pub cpu: f64,
+    /// Rays that left a task for a split that it did not hold.
+    pub hops: u64,
+    /// Attempts that ended, by how.
+    pub outcomes: BTreeMap<Outcome, u64>,
+    /// By worker.
+    pub by_worker: BTreeMap<u32, WorkerTally>,
+    /// Work that nobody has taken yet.
+    pub queued: u64,
+    /// Work in workers' hands.
+    pub running: u64,
     /// When the first attempt was handed out.
     pub first_attempt: Option<Instant>,
 }
@@ -145,7 +207,18 @@ impl Fleet {
     pub fn tally(&self) -> Tally {
         let state = self.lock();
         let ready = state.workers.iter().flatten().filter(|w| w.seen.elapsed() < SILENCE).count() as u32;
-        Tally { ready, bytes: state.bytes.clone(), cpu: state.cpu, first_attempt: state.first_attempt }
+        let ready_work: usize = state.workers.iter().flatten().map(|w| w.ready.len()).sum();
+        Tally {
+            ready,
+            bytes: state.bytes.clone(),
+            cpu: state.cpu,
+            hops: state.hops,
+            outcomes: state.outcomes.clone(),
+            by_worker: state.by_worker.clone(),
+            queued: (state.common.len() + ready_work) as u64,
+            running: state.doing.len() as u64,
+            first_attempt: state.first_attempt,
+        }
     }
     /// How many of the splits and of the texture tiles nobody has read since the stage began, of so many.
     pub fn never_read(&self, all: [usize; 2]) -> [u64; 2] {
@@ -246,12 +319,19 @@ impl Fleet {
         report.bytes.iter().for_each(|r| bytes.add(r.stage, r.op, r.kind, r.place, r.bytes));
         state.bytes.merge(&bytes);
         state.cpu += report.cpu;
+        let of_worker = state.by_worker.entry(report.worker.number).or_default();
+        of_worker.cpu += report.cpu;
+        of_worker.resident = report.resident;
         if state.stage.as_ref().is_some_and(|s| s.id == report.reads.stage) {
             state.read[0].extend(report.reads.splits);
             state.read[1].extend(report.reads.tiles);
         }
         match (doing.what, report.result) {
             (What::Attempt { task, number, .. }, result) => {
+                *state.outcomes.entry(Outcome::of(&result)).or_default() += 1;
+                if let Ok(Done::Made { hops, .. }) = &result {
+                    state.hops += hops;
+                }
                 let result = state.judge(result);
                 state.finished.push_back(Finished { task, number, result, cpu: report.cpu, bytes });
             }
@@ -429,6 +509,9 @@ impl State {
     /// A worker is gone: what it did is lost, what any worker can do is done by another.
     fn leave(&mut self, number: u32) {
         let Some(worker) = self.workers[number as usize].take() else { return };
+        if let Some(tally) = self.by_worker.get_mut(&number) {
+            tally.resident = 0;
+        }
         self.emptied.insert(number);
         for (task, attempt, _, _) in worker.ready {
             self.lose(task, attempt);
@@ -445,6 +528,7 @@ impl State {
     }
 
     fn lose(&mut self, task: TaskId, number: u32) {
+        *self.outcomes.entry(Outcome::Gone).or_default() += 1;
         let (result, bytes) = (Err(JobError::Stopped), Bytes::default());
         self.finished.push_back(Finished { task, number, result, cpu: 0.0, bytes });
     }

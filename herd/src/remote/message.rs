@@ -154,6 +154,9 @@ pub struct Report {
     /// What this worker has read of the scene for the first time.
     #[serde(default)]
     pub reads: Reads,
+    /// Bytes of scene data that it holds in memory.
+    #[serde(default)]
+    pub resident: u64,
 }
 
 /// Objects of a scene that a worker has read in a stage, and has not told of before.

@@ -276,7 +276,8 @@ impl<'l> Station<'l> {
         let bytes = shared.map_or_else(Bytes::default, |s| s.nodes.take_bytes()).rows();
         let (splits, tiles) = shared.map(|s| s.nodes.take_reads()).unwrap_or_default();
         let reads = Reads { stage: stage.map(|s| s.id.clone()).unwrap_or_default(), splits, tiles };
-        let report = Report { worker: self.worker.clone(), id: id.clone(), result, cpu, bytes, reads };
+        let resident = shared.map_or(0, |s| s.nodes.resident());
+        let report = Report { worker: self.worker.clone(), id: id.clone(), result, cpu, bytes, reads, resident };
         let since = Instant::now();
         while let Err(e) = self.link.report(&report) {
             tracing::warn!("{e}");
