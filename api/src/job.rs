@@ -15,6 +15,9 @@ pub const API_VERSION: &str = "rayherd.io/v1alpha1";
 /// The kind of [`RenderJob`].
 pub const KIND: &str = "RenderJob";
 
+/// What `spec.managedBy` is for the jobs that the operator works on.
+pub const MANAGED_BY: &str = "rayherd.io/operator";
+
 /// One scene, rendered from one or more cameras.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "camelCase", deny_unknown_fields)]
@@ -86,22 +89,27 @@ pub struct RenderJobSpec {
     pub splits: Option<i64>,
     /// Share of primitives in contested cells above which the scheduling grid is refined; 0.2 by default.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    #[schemars(range(min = 0.0, max = 1.0))]
+    #[schemars(range(min = 0.0, max = 1.0), extend("default" = 0.2))]
     pub overlap_threshold: Option<f64>,
     /// The machines: real ones on a cluster, virtual ones in a local run.
     #[serde(default)]
     pub workers: WorkersSpec,
     /// Nodes that hold a copy of each block, at most as many as the storage has servers (in a local run as there are nodes); 1 by default.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    #[schemars(range(min = 1, max = 16))]
+    #[schemars(range(min = 1, max = 16), extend("default" = 1))]
     pub replicas: Option<i32>,
     /// Whether all tasks of a round end before the next begins; by default false for `Auto`, true for the others.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub barrier: Option<bool>,
     /// Seconds of work that a task is sized to; 10 by default.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    #[schemars(range(min = 0.01, max = 3600.0))]
+    #[schemars(range(min = 0.01, max = 3600.0), extend("default" = 10.0))]
     pub task_seconds: Option<f64>,
+    /// Who works on the job on a cluster: `rayherd.io/operator`, and so it is by default. An operator leaves a job of another name
+    /// alone, for whoever has it to dispatch it elsewhere.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schemars(extend("maxLength" = 63, "pattern" = "^[a-z0-9.-]+/[a-zA-Z0-9._-]+$"))]
+    pub managed_by: Option<String>,
     /// How much a cluster cares that workers run beside the data. The image is the same bytes for all of them.
     #[serde(default)]
     pub placement: Placement,
@@ -127,10 +135,12 @@ pub struct RenderJobSpec {
 pub struct StorageSpec {
     /// Name of a profile that whoever runs the operator has set up; `default` by default.
     #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schemars(extend("default" = "default", "maxLength" = 200))]
     pub profile: Option<String>,
     /// Secret in the job's namespace that holds `AWS_ACCESS_KEY_ID` and `AWS_SECRET_ACCESS_KEY`; `rayherd-storage` by
     /// default.
     #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schemars(extend("default" = "rayherd-storage", "maxLength" = 253))]
     pub secret: Option<String>,
 }
 
@@ -153,7 +163,13 @@ pub enum Placement {
 pub struct SceneSpec {
     /// A Mitsuba XML file, a mesh (PLY, OBJ, STL), a folder of meshes, or a CT volume (DICOM folder, NRRD, NIfTI).
     /// A relative path in a job file is relative to that file.
+    #[serde(default, skip_serializing_if = "String::is_empty")]
     pub source: String,
+    /// Instead of a source, and of all that says how to import and cut it: a scene that is prepared in the job's storage, by the hash
+    /// that `status.scene` of an earlier job says. Nothing is read of its source, nor prepared. On a cluster only.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schemars(extend("pattern" = "^[0-9a-f]{64}$", "maxLength" = 64))]
+    pub prepared: Option<String>,
     /// Value of the surface to extract from a volume, in its rescaled units (Hounsfield for CT).
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub iso: Option<f64>,
@@ -162,9 +178,11 @@ pub struct SceneSpec {
     pub lights: Vec<LightSpec>,
     /// Radiance of a constant sky: one number or three (linear RGB), instead of the scene's; 0 is no sky.
     #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schemars(length(min = 1, max = 3), inner(range(min = 0.0)))]
     pub sky: Option<Vec<f64>>,
     /// Reflectance of a mesh or volume: one number or three (linear RGB) in 0 to 1.
     #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schemars(length(min = 1, max = 3), inner(range(min = 0.0, max = 1.0)))]
     pub albedo: Option<Vec<f64>>,
     /// Whether each unsupported element is replaced by a named stand-in instead of being an error.
     #[serde(default)]
@@ -185,6 +203,7 @@ pub struct LightSpec {
     /// Width and height, above 0.
     pub size: [f64; 2],
     /// Radiance (W/sr/m2): one number or three (linear RGB).
+    #[schemars(length(min = 1, max = 3), inner(range(min = 0.0)))]
     pub radiance: Vec<f64>,
 }
 
@@ -198,15 +217,16 @@ pub struct ImageSpec {
     /// One frame per camera, all from one prepared scene; without any, the scene's own camera or one that frames it.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub cameras: Vec<CameraSpec>,
-    /// The EXR file; the PNG stands beside it. With several cameras `-NAME` or `-0001`.. comes before the extension.
+    /// The EXR file; a local run writes a PNG beside it. With several cameras `-NAME` or `-0001`.. comes before the extension. A cluster
+    /// writes the EXR alone, as `output/NAMESPACE/NAME/` and this path, onto each server of the job's storage.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub output: Option<String>,
     /// Layers of the EXR beside the picture; those that the scene asks for by default, and an empty list is none.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub aovs: Option<Vec<Aov>>,
-    /// Exposure of the PNG in stops; 0 by default. The EXR is not changed by it.
+    /// Exposure of a local run's PNG in stops; 0 by default. The EXR is not changed by it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    #[schemars(range(min = -32.0, max = 32.0))]
+    #[schemars(range(min = -32.0, max = 32.0), extend("default" = 0.0))]
     pub exposure: Option<f64>,
 }
 
@@ -216,6 +236,7 @@ pub struct ImageSpec {
 pub struct CameraSpec {
     /// Name of the frame, of `[A-Za-z0-9._-]`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schemars(extend("pattern" = "^[A-Za-z0-9._-]+$", "maxLength" = 200))]
     pub name: Option<String>,
     /// Where it stands, in the scene's coordinates.
     pub origin: [f64; 3],
@@ -259,11 +280,11 @@ pub struct SamplingSpec {
     pub rr_depth: Option<i32>,
     /// Paths that go on from the first hit of each sample; 1 by default.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    #[schemars(range(min = 1, max = 512))]
+    #[schemars(range(min = 1, max = 512), extend("default" = 1))]
     pub split: Option<i32>,
     /// Seed of every random number; 0 by default.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    #[schemars(range(min = 0))]
+    #[schemars(range(min = 0), extend("default" = 0))]
     pub seed: Option<i64>,
 }
 
@@ -275,8 +296,18 @@ pub struct WorkersSpec {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[schemars(range(min = 1, max = 4096))]
     pub nodes: Option<i32>,
+    /// The fewest workers that a cluster keeps, together with `max` and instead of `nodes`: how many there are follows the rays that wait
+    /// and the camera samples that are not made yet.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schemars(range(min = 1, max = 4096))]
+    pub min: Option<i32>,
+    /// The most workers that a cluster keeps. A local run has so many nodes.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schemars(range(min = 1, max = 4096))]
+    pub max: Option<i32>,
     /// Tasks at a time per node: one number for all nodes, or one for each. By default the threads of the machine.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    #[schemars(inner(range(min = 1, max = 1024)))]
     pub slots: Vec<i32>,
     /// Scene data (geometry and attributes) that one node may hold in memory; rays and film come on top, bounded apart from it. By
     /// default there is no limit.
@@ -284,7 +315,7 @@ pub struct WorkersSpec {
     pub memory: Option<ByteSize>,
     /// Seconds for which a cluster keeps a finished job's workers, so that the same job with more samples goes on at once; 0 by default.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    #[schemars(range(min = 0, max = 86400))]
+    #[schemars(range(min = 0, max = 86400), extend("default" = 0))]
     pub keep_warm_seconds: Option<i64>,
     /// What a cluster's worker pods have beside what the operator gives them, as a PodTemplateSpec: labels, annotations, tolerations,
     /// node selectors, priority classes, pull secrets, and of the container `worker` its resources and more.
@@ -306,9 +337,9 @@ impl RenderJob {
 }
 
 impl WorkersSpec {
-    /// Slots of each node, `default` where none are given. `None` when the numbers contradict each other.
+    /// Slots of each node, of as many as there are at most, `default` where none are given. `None` when the numbers contradict each other.
     pub fn slots_per_node(&self, default: u32) -> Option<Vec<u32>> {
-        let nodes = self.nodes.map(|n| n as usize);
+        let nodes = self.nodes.or(self.max).map(|n| n as usize);
         match (&self.slots[..], nodes) {
             ([], n) => Some(vec![default; n.unwrap_or(1)]),
             ([one], n) => Some(vec![*one as u32; n.unwrap_or(1)]),

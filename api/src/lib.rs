@@ -12,6 +12,8 @@ pub mod job;
 mod reference;
 #[cfg(feature = "kube")]
 pub mod resource;
+#[cfg(feature = "kube")]
+pub mod rules;
 pub mod strategy;
 pub mod validate;
 
@@ -19,8 +21,8 @@ pub use aov::{Aov, AovList};
 pub use byte_size::ByteSize;
 pub use image_size::ImageSize;
 pub use job::{
-    API_VERSION, CameraSpec, ImageSpec, KIND, LightSpec, Metadata, Placement, RenderJob, RenderJobSpec, SamplingSpec,
-    SceneSpec, StorageSpec, WorkersSpec,
+    API_VERSION, CameraSpec, ImageSpec, KIND, LightSpec, MANAGED_BY, Metadata, Placement, RenderJob, RenderJobSpec,
+    SamplingSpec, SceneSpec, StorageSpec, WorkersSpec,
 };
 pub use strategy::Strategy;
 pub use validate::{Problem, validate, validate_local};

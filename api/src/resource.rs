@@ -8,6 +8,7 @@ use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
 pub use crate::job::RenderJobObject;
+use crate::rules::RULES;
 use crate::{API_VERSION, KIND, Metadata, RenderJob};
 
 /// What the operator says of a job. Of bounded size, whatever the job.
@@ -24,7 +25,7 @@ pub struct RenderJobStatus {
     /// `Pending`, `Preparing`, `Rendering`, `Suspended`, `Complete` or `Failed`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub phase: Option<String>,
-    /// Camera samples made of those asked for, `42%`.
+    /// Camera samples made of those asked for, over all frames, `42%`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub progress: Option<String>,
     /// Estimated relMSE of the last frame that is done.
@@ -39,7 +40,13 @@ pub struct RenderJobStatus {
     /// Scene bytes that were read from other nodes, of all that were read from stores.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub remote_read_ratio: Option<String>,
-    /// CPU-seconds of all workers' tasks.
+    /// Bytes of that: of the scene, read from stores.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub scene_bytes_read: Option<i64>,
+    /// Those of them that came from other nodes.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub scene_bytes_remote: Option<i64>,
+    /// CPU-seconds of all workers' tasks, since the job was made.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub cpu_seconds: Option<i64>,
     /// Workers that ask for work, of those wanted: `2/3`.
@@ -54,15 +61,19 @@ pub struct RenderJobStatus {
     /// `per node` where each store is on a node of the cluster, else `none`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub locality: Option<String>,
-    /// Of each frame that was begun, the newest round record that counts.
+    /// The newest round records that count: of the last frames that were begun, and an object with those of all others.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub ledger: Vec<LedgerPointer>,
-    /// Committed tasks of the frames that are done that were done again, because all copies of what they made were lost.
+    /// Committed tasks of the frames that are done that were done again, because all copies of what they made were lost, since the job
+    /// was made.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub tasks_redone: Option<i64>,
-    /// The finished pictures.
-    #[serde(default, skip_serializing_if = "Vec::is_empty")]
-    pub pictures: Vec<String>,
+    /// Frames whose pictures are written.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub frames_done: Option<i64>,
+    /// Where the pictures are: the picture itself, or of several cameras the folder, which ends in `/`.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub output: Option<String>,
     /// When work began, or went on after a suspension.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub start_time: Option<Time>,
@@ -78,9 +89,9 @@ pub struct RenderJobStatus {
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "camelCase")]
 pub struct LedgerPointer {
-    /// Number of the frame, from 0.
+    /// Number of the frame, from 0; -1 stands for an object that holds the pointers of many.
     pub frame: i32,
-    /// Place of the record in the chain.
+    /// Place of the record in the chain; of an object, how many pointers it holds.
     pub sequence: i64,
     /// Its name: the hash of its bytes.
     pub record: String,
@@ -95,43 +106,6 @@ impl RenderJobObject {
     }
 }
 
-/// Rules that the API server checks at apply: where in the schema, CEL, what to do.
-const RULES: &[(&[&str], &str, &str)] = &[
-    (&["spec"], "!(has(self.blockSize) && has(self.splits))", "give blockSize or splits, not both"),
-    (&["spec", "scene"], "self.source.trim() != ''", "spec.scene.source is empty: name a scene in the storage"),
-    (
-        &["spec", "scene"],
-        "!self.source.contains('://') && !self.source.startsWith('/') && !self.source.split('/').exists(p, p.startsWith('.'))",
-        "spec.scene.source is a key in the job's storage, such as scenes/room/room.xml",
-    ),
-    (&["spec", "scene"], "self.source == oldSelf.source", "the scene of a job cannot be changed: make another job"),
-    (
-        &["spec", "image"],
-        "!has(self.output) || (self.output.endsWith('.exr') && self.output.size() > 4 && !self.output.startsWith('/') && !self.output.split('/').exists(p, p.startsWith('.')))",
-        "spec.image.output ends in .exr and is a relative path",
-    ),
-    (
-        &["spec", "sampling"],
-        "!has(self.targetError) || self.targetError > 0.0",
-        "spec.sampling.targetError is above 0, such as 0.01",
-    ),
-    (
-        &["spec", "sampling"],
-        "!has(self.spp) || !has(oldSelf.spp) || self.spp >= oldSelf.spp",
-        "spec.sampling.spp can be raised only: make another job for fewer samples",
-    ),
-    (
-        &["spec", "sampling"],
-        "(has(self.seed) ? self.seed : 0) == (has(oldSelf.seed) ? oldSelf.seed : 0)",
-        "the seed of a job cannot be changed: make another job",
-    ),
-    (
-        &["spec", "workers"],
-        "!has(self.slots) || self.slots.size() < 2 || !has(self.nodes) || self.slots.size() == self.nodes",
-        "spec.workers.slots has one number for all workers, or one for each",
-    ),
-];
-
 /// The definition of the resource, with its rules.
 ///
 /// # Errors
@@ -140,10 +114,12 @@ pub fn definition() -> Result<CustomResourceDefinition, serde_json::Error> {
     let mut crd = serde_json::to_value(RenderJobObject::crd())?;
     let schema = &mut crd["spec"]["versions"][0]["schema"]["openAPIV3Schema"];
     tidy(schema);
+    schema["description"] =
+        json!("One scene, rendered from one or more cameras by worker pods beside the storage that holds it.");
     for (path, rule, message) in RULES {
         let mut at = &mut *schema;
         for name in *path {
-            at = &mut at["properties"][*name];
+            at = if *name == "items" { &mut at["items"] } else { &mut at["properties"][*name] };
         }
         let entry = json!({ "rule": rule, "message": message });
         match at["x-kubernetes-validations"].as_array_mut() {
@@ -173,6 +149,9 @@ fn tidy(schema: &mut Value) {
             if is("array", map) && !map.contains_key("maxItems") {
                 map.insert("maxItems".into(), json!(4096));
             }
+            if map.contains_key("additionalProperties") && !map.contains_key("maxProperties") {
+                map.insert("maxProperties".into(), json!(1024));
+            }
             map.values_mut().for_each(tidy);
         }
         Value::Array(items) => items.iter_mut().for_each(tidy),
@@ -198,7 +177,7 @@ mod tests {
             let mut at =
                 &serde_json::to_value(&crd).unwrap()["spec"]["versions"][0]["schema"]["openAPIV3Schema"].clone();
             for name in *path {
-                at = &at["properties"][*name];
+                at = if *name == "items" { &at["items"] } else { &at["properties"][*name] };
             }
             assert!(at.get("type").is_some(), "{path:?} is no part of the schema");
         }

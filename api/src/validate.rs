@@ -29,7 +29,31 @@ pub fn validate(job: &RenderJob) -> Vec<Problem> {
     c.check("kind", job.kind == KIND, || format!("is {:?}, but must be {KIND}", job.kind));
 
     let scene = &spec.scene;
-    c.check("spec.scene.source", !scene.source.trim().is_empty(), || "is empty: name a scene file or folder".into());
+    match &scene.prepared {
+        None => c.check("spec.scene.source", !scene.source.trim().is_empty(), || {
+            "is empty: name a scene file or folder".into()
+        }),
+        Some(hash) => {
+            let is_hash = hash.len() == 64 && hash.bytes().all(|b| matches!(b, b'0'..=b'9' | b'a'..=b'f'));
+            c.check("spec.scene.prepared", is_hash, || {
+                format!("is {hash:?}: give the 64 hexadecimal digits that status.scene of an earlier job says")
+            });
+            c.check("spec.scene.prepared", scene.source.is_empty(), || {
+                "is given together with spec.scene.source: keep one of them".into()
+            });
+            let imported = scene.iso.is_some()
+                || scene.sky.is_some()
+                || scene.albedo.is_some()
+                || scene.substitute
+                || !(scene.lights.is_empty() && scene.define.is_empty());
+            c.check("spec.scene.prepared", !imported, || {
+                "is imported already: leave out iso, lights, sky, albedo, define and substitute".into()
+            });
+            c.check("spec.scene.prepared", spec.block_size.is_none() && spec.splits.is_none(), || {
+                "is cut already: leave out spec.blockSize and spec.splits".into()
+            });
+        }
+    }
     if let Some(iso) = scene.iso {
         c.check("spec.scene.iso", iso.is_finite(), || format!("is {iso}: give a finite value"));
     }
@@ -134,6 +158,17 @@ fn check_image(c: &mut Checks, job: &RenderJob) {
 fn check_workers(c: &mut Checks, job: &RenderJob) {
     let workers = &job.spec.workers;
     c.range("spec.workers.nodes", workers.nodes.map(f64::from), 1.0, 4096.0);
+    c.range("spec.workers.min", workers.min.map(f64::from), 1.0, 4096.0);
+    c.range("spec.workers.max", workers.max.map(f64::from), 1.0, 4096.0);
+    c.check("spec.workers.min", workers.min.is_some() == workers.max.is_some() && workers.min <= workers.max, || {
+        "and spec.workers.max are given together, the first at most the second".into()
+    });
+    c.check("spec.workers.nodes", workers.nodes.is_none() || workers.max.is_none(), || {
+        "is given together with spec.workers.max: keep one of them".into()
+    });
+    c.check("spec.workers.slots", workers.max.is_none() || workers.slots.len() < 2, || {
+        "has several numbers, but with spec.workers.max there is one for all".into()
+    });
     for (i, &slots) in workers.slots.iter().enumerate() {
         c.range(&format!("spec.workers.slots[{i}]"), Some(f64::from(slots)), 1.0, 1024.0);
     }
@@ -164,7 +199,7 @@ fn check_workers(c: &mut Checks, job: &RenderJob) {
 pub fn validate_local(job: &RenderJob) -> Vec<Problem> {
     let mut c = Checks(Vec::new());
     let workers = &job.spec.workers;
-    let nodes = workers.nodes.map_or(workers.slots.len().max(1), |n| n.max(1) as usize);
+    let nodes = workers.nodes.or(workers.max).map_or(workers.slots.len().max(1), |n| n.max(1) as usize);
     if let Some(replicas) = job.spec.replicas {
         c.check("spec.replicas", replicas < 1 || replicas as usize <= nodes, || {
             format!("is {replicas}, but there are {nodes} nodes: ask for at most one copy per node")
@@ -258,7 +293,6 @@ spec:
         for (from, to, parts) in [
             ("    size:", "    sise:", ["unknown field `sise`", "`size`"]),
             ("  replicas: 2", "  replica: 2", ["unknown field `replica`", "`replicas`"]),
-            ("source: chest, ", "", ["missing field `source`", "spec.scene"]),
             ("size: 256x256", "size: 256", ["spec.image", "WIDTHxHEIGHT"]),
             ("size: 256x256", "size: 0x256", ["spec.image", "line 11"]),
             ("memory: 512Mi", "memory: 512K", ["spec.workers", "ambiguous"]),
@@ -268,6 +302,26 @@ spec:
             let error = parse(&FULL.replacen(from, to, 1)).unwrap_err().to_string();
             assert!(parts.iter().all(|p| error.contains(p)), "{from} -> {to}: {error}");
         }
+    }
+
+    #[test]
+    fn a_prepared_scene_and_bounds_of_workers_stand_in_for_others() {
+        let mut job = parse(FULL).unwrap();
+        job.spec.scene = crate::SceneSpec { prepared: Some("0".repeat(64)), ..Default::default() };
+        (job.spec.splits, job.spec.workers.nodes, job.spec.workers.slots) = (None, None, vec![2]);
+        (job.spec.workers.min, job.spec.workers.max) = (Some(2), Some(3));
+        assert_eq!(validate(&job), []);
+        assert_eq!(job.spec.workers.slots_per_node(1), Some(vec![2; 3]));
+        job.spec.scene.source = "a.xml".into();
+        job.spec.scene.iso = Some(1.0);
+        job.spec.splits = Some(2);
+        job.spec.workers.min = Some(4);
+        job.spec.workers.nodes = Some(3);
+        let fields: Vec<String> = validate(&job).into_iter().map(|p| p.field).collect();
+        assert_eq!(fields[..3], ["spec.scene.prepared"; 3]);
+        assert_eq!(fields[3..], ["spec.workers.min", "spec.workers.nodes"]);
+        job.spec.scene.prepared = Some("G".into());
+        assert!(validate(&job)[0].message.contains("64 hexadecimal digits"));
     }
 
     #[test]

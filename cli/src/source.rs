@@ -33,6 +33,11 @@ pub fn open(
     outputs: &[PathBuf],
     skips: Skips,
 ) -> anyhow::Result<Opened> {
+    if spec.scene.prepared.is_some() {
+        anyhow::bail!(
+            "spec.scene.prepared names a scene in a cluster's storage: give its source (spec.scene.source, or SCENE)"
+        );
+    }
     let scene = Path::new(&spec.scene.source);
     distinct::check_inputs(outputs, [scene])?;
     let description = import(scene, &import_options(spec))?;

@@ -320,6 +320,10 @@ impl Memory {
     pub fn peak(&self) -> u64 {
         lock(&self.state).peak
     }
+    /// Bytes of the splits that it holds, or is loading.
+    pub fn held(&self) -> u64 {
+        lock(&self.state).held.iter().map(|h| h.bytes).sum()
+    }
     /// The splits that it holds, or is loading.
     pub fn warm(&self) -> BTreeSet<u32> {
         lock(&self.state).held.iter().flat_map(|h| h.set.iter().copied()).collect()

@@ -41,6 +41,25 @@ pub fn slots(job: &RenderJobObject) -> Vec<u32> {
     job.spec.workers.slots_per_node(1).unwrap_or_else(|| vec![1])
 }
 
+/// Work for each slot, rays or camera samples: some seconds' of it.
+const WORK: u64 = 1 << 20;
+
+/// How many workers a job is to have: as many as `slots` has numbers, or where it has bounds, as many as what is `to_do` (rays and camera
+/// samples) gives work to. `now` is how many it was to have so far: there are more at once, and fewer when half of them would do, so
+/// that a wave's end sends nobody away.
+pub fn wanted(job: &RenderJobObject, to_do: u64, now: Option<u32>) -> u32 {
+    let (workers, slots) = (&job.spec.workers, slots(job));
+    let most = slots.len() as u32;
+    let Some(least) = workers.min.and_then(|n| u32::try_from(n).ok()).filter(|_| workers.max.is_some()) else {
+        return most;
+    };
+    let each = u64::from(slots.first().copied().unwrap_or(1).max(1)) * WORK;
+    let need = to_do.div_ceil(each).min(u64::from(most)) as u32;
+    let now = now.unwrap_or(least);
+    let next = if need > now || need * 2 <= now { need } else { now };
+    next.clamp(least.min(most), most)
+}
+
 /// Scene data that a worker holds, bytes.
 pub fn memory(job: &RenderJobObject) -> u64 {
     job.spec.workers.memory.map_or(DEFAULT_MEMORY, ByteSize::bytes)
@@ -605,6 +624,31 @@ mod tests {
             "containers": [{"name": "worker", "volumeMounts": [{"name": "fast", "mountPath": "/cache"}]}],
         }}));
         assert_eq!(at(&made(&own, &with), "/spec/containers/0/volumeMounts/1/name"), json!("fast"));
+    }
+
+    #[test]
+    fn workers_follow_the_work_but_not_each_wave() {
+        let mut job = job();
+        assert_eq!((wanted(&job, 0, None), wanted(&job, u64::MAX, Some(1))), (3, 3), "as many as it asks for");
+        let workers = &mut job.spec.workers;
+        (workers.nodes, workers.min, workers.max, workers.slots) = (None, Some(2), Some(20), vec![4]);
+        let each = 4 * WORK;
+        assert_eq!(slots(&job).len(), 20);
+        assert_eq!((wanted(&job, 0, None), wanted(&job, u64::MAX, Some(2))), (2, 20));
+        assert_eq!((wanted(&job, 5 * each, Some(2)), wanted(&job, 5 * each + 1, Some(2))), (5, 6), "more at once");
+        // less to do: all stay, until half of them would do
+        assert_eq!((wanted(&job, 7 * each, Some(12)), wanted(&job, 6 * each, Some(12))), (12, 6));
+        assert_eq!(wanted(&job, 0, Some(12)), 2);
+        // one that goes up and down by less than a half keeps its workers
+        let mut now = 10;
+        for to_do in [10, 6, 9, 7, 10, 6] {
+            now = wanted(&job, to_do * each, Some(now));
+            assert_eq!(now, 10);
+        }
+        // bounds that were changed hold at once
+        job.spec.workers.max = Some(3);
+        assert_eq!(wanted(&job, 0, Some(20)), 2);
+        assert_eq!(wanted(&job, u64::MAX, Some(20)), 3);
     }
 
     #[test]

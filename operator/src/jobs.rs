@@ -5,9 +5,10 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError, RwLock};
 
 use k8s_openapi::jiff::Timestamp;
 use rayherd_api::RenderJobSpec;
+use rayherd_api::resource::RenderJobObject;
 use rayherd_herd::job::Status;
 use rayherd_herd::remote::{Fleet, Storage};
-use rayherd_herd::report::Report;
+use rayherd_herd::report::{RayCounts, Report};
 
 use crate::backoff::Rests;
 use crate::storage::is_local;
@@ -26,9 +27,36 @@ pub struct Running {
     pub state: Mutex<State>,
 }
 
+/// What was counted of a job before its thread began: by an earlier operator, before a suspension, or of an earlier spec.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Before {
+    /// CPU-seconds.
+    pub cpu: i64,
+    /// Bytes of the scene that were read, and those of them that came from other nodes.
+    pub read: [i64; 2],
+    /// Tasks that were done again.
+    pub redone: i64,
+}
+
+impl Before {
+    /// As a job's status has it.
+    pub fn of(job: &RenderJobObject) -> Self {
+        let Some(s) = &job.status else { return Before::default() };
+        Before {
+            cpu: s.cpu_seconds.unwrap_or(0),
+            read: [s.scene_bytes_read.unwrap_or(0), s.scene_bytes_remote.unwrap_or(0)],
+            redone: s.tasks_redone.unwrap_or(0),
+        }
+    }
+}
+
 /// How far a job is.
 #[derive(Clone, Debug, Default)]
 pub struct State {
+    /// What was counted before.
+    pub before: Before,
+    /// How many workers it is to have, where that follows the work.
+    pub wanted: Option<u32>,
     /// When its thread began.
     pub started: Option<Timestamp>,
     /// When the first trace task was handed out.
@@ -47,8 +75,8 @@ pub struct State {
     pub status: Status,
     /// Of the frames that are done.
     pub reports: Vec<Report>,
-    /// The finished pictures.
-    pub pictures: Vec<String>,
+    /// Address of the last picture that is finished.
+    pub picture: Option<String>,
     /// How it ended, and when.
     pub end: Option<(Timestamp, Result<(), Problem>)>,
     /// Containers that were killed for lack of memory, as far as that was told; none before the pods were looked at first, when those
@@ -69,6 +97,31 @@ pub struct Problem {
     pub message: String,
     /// This operator was told to stop running it: nothing is wrong with the job.
     pub stopped: bool,
+}
+
+impl State {
+    /// Camera samples made of those asked for, over all of so many frames: 0 to 1.
+    pub fn progress(&self, frames: usize) -> f64 {
+        let s = &self.status;
+        let part = if s.samples_total == 0 { 0.0 } else { (s.samples as f64 / s.samples_total as f64).min(1.0) };
+        ((self.reports.len() as f64 + part) / frames.max(1) as f64).min(1.0)
+    }
+    /// Rays of the frames that are done and of the current one.
+    pub fn rays(&self) -> RayCounts {
+        let mut rays = self.status.rays;
+        self.reports.iter().for_each(|r| rays.merge(&r.rays));
+        rays
+    }
+    /// A frame is done: what is told of the current one is of the next, but for its rounds.
+    pub fn done(&mut self, picture: Option<String>, report: Report) {
+        self.picture = picture.or(self.picture.take());
+        self.reports.push(report);
+        (self.status.samples, self.status.rays) = (0, RayCounts::default());
+    }
+    /// How much there is for workers to do: rays that wait, and camera samples of the current frame that are not made yet.
+    pub fn to_do(&self) -> u64 {
+        self.status.waiting + self.status.samples_total.saturating_sub(self.status.samples)
+    }
 }
 
 impl Running {

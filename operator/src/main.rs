@@ -31,13 +31,14 @@ use k8s_openapi::api::core::v1::Pod;
 use kube::api::{Patch, PatchParams};
 use kube::runtime::controller::{self, Controller};
 use kube::runtime::watcher;
-use kube::{Api, Client};
+use kube::{Api, client::ClientBuilder};
 use rayherd_api::resource::definition;
 use serde_json::json;
 use tokio::signal::unix::{SignalKind, signal};
 
 use config::Config;
 use lease::Lease;
+use metrics::Metrics;
 use reconcile::Context;
 
 /// The API server ends a watch after this many seconds; below what load balancers and proxies cut silently.
@@ -89,8 +90,10 @@ async fn run() -> anyhow::Result<()> {
     // one provider for every TLS connection of the process
     let _ = rustls::crypto::ring::default_provider().install_default();
     let config = Config::from_env()?;
-    let client = Client::try_default().await?;
-    let context = Arc::new(Context::new(client.clone(), config)?);
+    let metrics = Metrics::new()?;
+    let settings = kube::Config::infer().await?;
+    let client = ClientBuilder::try_from(settings)?.with_layer(&metrics.requests()).build();
+    let context = Arc::new(Context::new(client.clone(), config, metrics));
     let mut metrics = tokio::spawn(metrics::serve(context.clone()));
     let Config { namespace, pod, lease, .. } = &context.config;
     leads(&context, false).await?;

@@ -1,18 +1,25 @@
 //! What the operator tells Prometheus.
 
+use std::collections::HashMap;
 use std::sync::Arc;
 use std::time::Instant;
 
 use axum::Router;
-use axum::extract::State;
-use axum::http::StatusCode;
+use axum::extract::State as Given;
+use axum::http::{Request, StatusCode};
 use axum::routing::get;
+use kube::client::Body;
+use prometheus::core::{Atomic, Collector, GenericCounter, MetricVec, MetricVecBuilder};
 use prometheus::{
-    Encoder, GaugeVec, Histogram, HistogramOpts, IntCounter, IntCounterVec, IntGauge, Opts, Registry, TextEncoder,
+    CounterVec, Encoder, GaugeVec, Histogram, HistogramOpts, IntCounter, IntCounterVec, IntGauge, Opts, Registry,
+    TextEncoder,
 };
+use rayherd_api::RenderJobSpec;
+use rayherd_herd::remote::fleet::{Outcome, Tally};
 use rayherd_herd::report::{Kind, Op, Place};
+use tower::util::MapRequestLayer;
 
-use crate::jobs::Running;
+use crate::jobs::{Running, State};
 use crate::reconcile::Context;
 
 /// All metrics.
@@ -27,15 +34,28 @@ pub struct Metrics {
     /// Reports that nobody waits for (any more).
     pub ignored: IntCounter,
     refused: IntCounterVec,
+    asked: IntCounterVec,
     /// 1 for the operator that leads.
     pub leader: IntGauge,
     /// How long steps take.
     pub reconcile_seconds: Histogram,
-    cpu: GaugeVec,
+    of_jobs: OfJobs,
+}
+
+/// Families whose labels are those of jobs, and go with them.
+struct OfJobs {
+    cpu: CounterVec,
+    bytes: IntCounterVec,
+    rays: IntCounterVec,
+    hops: IntCounterVec,
+    tasks: IntCounterVec,
+    worker_cpu: CounterVec,
+    worker_slots: GaugeVec,
+    resident: GaugeVec,
     remote: GaugeVec,
-    bytes: GaugeVec,
     rounds: GaugeVec,
-    tasks: GaugeVec,
+    queued: GaugeVec,
+    running: GaugeVec,
     waiting: GaugeVec,
     workers: GaugeVec,
     wanted: GaugeVec,
@@ -43,7 +63,7 @@ pub struct Metrics {
     progress: GaugeVec,
     degraded: GaugeVec,
     error: GaugeVec,
-    cache_failures: GaugeVec,
+    cache_failures: IntCounterVec,
 }
 
 /// Why the task server refused a request.
@@ -70,6 +90,7 @@ impl Refused {
 }
 
 const JOB: [&str; 2] = ["namespace", "job"];
+const WORKER: [&str; 3] = ["namespace", "job", "worker"];
 
 impl Metrics {
     /// All at 0.
@@ -83,11 +104,6 @@ impl Metrics {
             registry.register(Box::new(counter.clone()))?;
             Ok(counter)
         };
-        let gauge = |name: &str, help: &str, labels: &[&str]| -> prometheus::Result<GaugeVec> {
-            let gauge = GaugeVec::new(Opts::new(name, help), labels)?;
-            registry.register(Box::new(gauge.clone()))?;
-            Ok(gauge)
-        };
         let buckets = vec![0.001, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0, 3.0];
         let options = HistogramOpts::new("rayherd_reconcile_duration_seconds", "duration of a reconcile step");
         let reconcile_seconds = Histogram::with_opts(options.buckets(buckets))?;
@@ -98,6 +114,9 @@ impl Metrics {
         registry.register(Box::new(refused.clone()))?;
         let leader = IntGauge::new("rayherd_leader", "1 for the operator that leads, 0 for one that waits")?;
         registry.register(Box::new(leader.clone()))?;
+        let name = "rayherd_api_requests_total";
+        let asked = IntCounterVec::new(Opts::new(name, "requests to the API server"), &["verb"])?;
+        registry.register(Box::new(asked.clone()))?;
         for reason in Refused::ALL {
             refused.with_label_values(&[reason.name()]);
         }
@@ -107,24 +126,9 @@ impl Metrics {
             started: counter("rayherd_jobs_started_total", "jobs that were begun or gone on with")?,
             ignored: counter("rayherd_worker_reports_ignored_total", "reports of work that nobody waits for")?,
             refused,
+            asked,
             leader,
-            cpu: gauge("rayherd_job_cpu_seconds", "CPU-seconds of the workers' tasks", &JOB)?,
-            remote: gauge("rayherd_job_remote_read_ratio", "scene bytes read from other nodes, of all read", &JOB)?,
-            bytes: gauge("rayherd_job_bytes", "bytes moved", &["namespace", "job", "stage", "op", "kind", "place"])?,
-            rounds: gauge("rayherd_job_rounds", "rounds of the current frame", &JOB)?,
-            tasks: gauge("rayherd_job_tasks", "tasks committed for the frames that are done", &JOB)?,
-            waiting: gauge("rayherd_job_rays_waiting", "rays that wait in groups", &JOB)?,
-            workers: gauge("rayherd_job_workers_ready", "workers that ask for work", &JOB)?,
-            wanted: gauge("rayherd_job_workers_wanted", "workers that the job asks for", &JOB)?,
-            slots: gauge("rayherd_job_slots", "tasks that all its workers do at a time", &JOB)?,
-            progress: gauge("rayherd_job_progress_ratio", "camera samples made of those asked for", &JOB)?,
-            degraded: gauge("rayherd_job_degraded", "1 while there are fewer copies than asked for", &JOB)?,
-            error: gauge("rayherd_job_relmse", "estimated relMSE of the last frame that is done", &JOB)?,
-            cache_failures: gauge(
-                "rayherd_job_cache_failures",
-                "copies that the workers' caches could not keep, or have lost",
-                &JOB,
-            )?,
+            of_jobs: OfJobs::new(&registry)?,
             reconcile_seconds,
             registry,
         })
@@ -135,84 +139,25 @@ impl Metrics {
         self.refused.with_label_values(&[reason.name()]).inc();
     }
 
+    /// Counts requests to the API server, by verb, on their way.
+    pub fn requests(&self) -> MapRequestLayer<impl Fn(Request<Body>) -> Request<Body> + Clone + use<>> {
+        let asked = self.asked.clone();
+        MapRequestLayer::new(move |request: Request<Body>| {
+            asked.with_label_values(&[&request.method().as_str().to_ascii_lowercase()]).inc();
+            request
+        })
+    }
+
     /// Sets a job's metrics.
     pub fn observe(&self, namespace: &str, job: &str, running: &Running) {
         let (state, tally) = (running.lock().clone(), running.fleet.tally());
-        let labels = [namespace, job];
-        let scene = |k: Kind| matches!(k, Kind::Geometry | Kind::Attributes | Kind::Texture);
-        let read = |place: Place| tally.bytes.sum(|_, o, k, p| o == Op::Read && p == place && scene(k));
-        let (near, far) = (read(Place::Local), read(Place::Remote));
-        // where no server is on a node all are far, and that is no fault
-        if running.is_local() && near + far > 0 {
-            self.remote.with_label_values(&labels).set(far as f64 / (near + far) as f64);
-        }
-        for row in tally.bytes.rows() {
-            // the names that reports use
-            let name = |v: serde_json::Result<serde_json::Value>| match v {
-                Ok(serde_json::Value::String(s)) => s,
-                _ => String::new(),
-            };
-            let (stage, op) = (name(serde_json::to_value(row.stage)), name(serde_json::to_value(row.op)));
-            let (kind, place) = (name(serde_json::to_value(row.kind)), name(serde_json::to_value(row.place)));
-            let labels = [namespace, job, &stage, &op, &kind, &place];
-            self.bytes.with_label_values(&labels).set(row.bytes as f64);
-        }
-        self.cpu.with_label_values(&labels).set(tally.cpu);
-        self.cache_failures.with_label_values(&labels).set(tally.cache_failures as f64);
-        self.rounds.with_label_values(&labels).set(state.status.rounds as f64);
-        self.tasks.with_label_values(&labels).set(state.reports.iter().map(|r| r.tasks).sum::<u64>() as f64);
-        self.waiting.with_label_values(&labels).set(state.status.waiting as f64);
-        // workers that are kept warm have nothing to do, and should have
-        let over = state.end.is_some();
-        self.workers.with_label_values(&labels).set(if over { 0.0 } else { f64::from(tally.ready) });
-        let slots = running.spec.workers.slots_per_node(1).filter(|_| !over).unwrap_or_default();
-        self.wanted.with_label_values(&labels).set(slots.len() as f64);
-        self.slots.with_label_values(&labels).set(slots.iter().map(|&s| f64::from(s)).sum());
-        let (made, of) = (state.status.samples, state.status.samples_total.max(1));
-        self.progress.with_label_values(&labels).set((made as f64 / of as f64).min(1.0));
-        self.degraded.with_label_values(&labels).set(f64::from(u8::from(state.below.is_some())));
-        if let Some(error) = state.reports.last().and_then(|r| r.rel_mse) {
-            self.error.with_label_values(&labels).set(error);
-        }
+        let local = running.is_local();
+        self.of_jobs.observe([namespace, job], &running.spec, &state, &tally, local);
     }
 
     /// A job has ended: its labels go.
     pub fn forget(&self, namespace: &str, job: &str) {
-        let gauges = [
-            &self.cpu,
-            &self.remote,
-            &self.rounds,
-            &self.tasks,
-            &self.waiting,
-            &self.workers,
-            &self.wanted,
-            &self.slots,
-            &self.progress,
-            &self.degraded,
-            &self.error,
-            &self.cache_failures,
-        ];
-        for gauge in gauges {
-            // one that was never set has nothing to remove
-            let _ = gauge.remove_label_values(&[namespace, job]);
-        }
-        self.forget_bytes(namespace, job);
-    }
-
-    fn forget_bytes(&self, namespace: &str, job: &str) {
-        use prometheus::core::Collector;
-        for family in self.bytes.collect() {
-            for metric in family.get_metric() {
-                let value = |n: &str| metric.get_label().iter().find(|l| l.name() == n).map(|l| l.value().to_owned());
-                if value("namespace").as_deref() != Some(namespace) || value("job").as_deref() != Some(job) {
-                    continue;
-                }
-                let all: Vec<String> =
-                    ["namespace", "job", "stage", "op", "kind", "place"].iter().filter_map(|n| value(n)).collect();
-                let all: Vec<&str> = all.iter().map(String::as_str).collect();
-                let _ = self.bytes.remove_label_values(&all);
-            }
-        }
+        self.of_jobs.forget(namespace, job);
     }
 
     /// As text.
@@ -226,23 +171,188 @@ impl Metrics {
     }
 }
 
-async fn health(State(context): State<Arc<Context>>) -> (StatusCode, &'static str) {
+async fn health(Given(context): Given<Arc<Context>>) -> (StatusCode, &'static str) {
     if context.watching.is_dead(Instant::now()) {
         return (StatusCode::SERVICE_UNAVAILABLE, "the API server cannot be watched");
     }
     (StatusCode::OK, "ok")
 }
 
+impl OfJobs {
+    fn new(registry: &Registry) -> prometheus::Result<Self> {
+        let gauge = |name: &str, help: &str, labels: &[&str]| -> prometheus::Result<GaugeVec> {
+            let gauge = GaugeVec::new(Opts::new(name, help), labels)?;
+            registry.register(Box::new(gauge.clone()))?;
+            Ok(gauge)
+        };
+        let counter = |name: &str, help: &str, labels: &[&str]| -> prometheus::Result<IntCounterVec> {
+            let counter = IntCounterVec::new(Opts::new(name, help), labels)?;
+            registry.register(Box::new(counter.clone()))?;
+            Ok(counter)
+        };
+        let seconds = |name: &str, help: &str, labels: &[&str]| -> prometheus::Result<CounterVec> {
+            let counter = CounterVec::new(Opts::new(name, help), labels)?;
+            registry.register(Box::new(counter.clone()))?;
+            Ok(counter)
+        };
+        let bytes = ["namespace", "job", "stage", "op", "kind", "place"];
+        Ok(OfJobs {
+            cpu: seconds("rayherd_job_cpu_seconds_total", "CPU-seconds of the workers' tasks", &JOB)?,
+            bytes: counter("rayherd_job_bytes_total", "bytes moved", &bytes)?,
+            rays: counter("rayherd_job_rays_total", "rays of committed tasks", &["namespace", "job", "kind"])?,
+            hops: counter("rayherd_job_hops_total", "rays that left a task for a split that it did not hold", &JOB)?,
+            tasks: counter(
+                "rayherd_job_tasks_total",
+                "attempts at tasks that ended",
+                &["namespace", "job", "outcome"],
+            )?,
+            worker_cpu: seconds("rayherd_worker_cpu_seconds_total", "CPU-seconds of a worker's tasks", &WORKER)?,
+            worker_slots: gauge("rayherd_worker_slots", "tasks that a worker does at a time", &WORKER)?,
+            resident: gauge("rayherd_worker_resident_bytes", "scene data that a worker holds in memory", &WORKER)?,
+            remote: gauge("rayherd_job_remote_read_ratio", "scene bytes read from other nodes, of all read", &JOB)?,
+            rounds: gauge("rayherd_job_rounds", "rounds of the current frame", &JOB)?,
+            queued: gauge("rayherd_job_queue_depth", "tasks and other work that no worker has taken yet", &JOB)?,
+            running: gauge("rayherd_job_tasks_running", "tasks and other work in workers' hands", &JOB)?,
+            waiting: gauge("rayherd_job_rays_waiting", "rays that wait in groups", &JOB)?,
+            workers: gauge("rayherd_job_workers_ready", "workers that ask for work", &JOB)?,
+            wanted: gauge("rayherd_job_workers_wanted", "workers that the job asks for", &JOB)?,
+            slots: gauge("rayherd_job_slots", "tasks that all its workers do at a time", &JOB)?,
+            progress: gauge("rayherd_job_progress_ratio", "camera samples made of those asked for", &JOB)?,
+            degraded: gauge("rayherd_job_degraded", "1 while there are fewer copies than asked for", &JOB)?,
+            error: gauge("rayherd_job_relmse", "estimated relMSE of the last frame that is done", &JOB)?,
+            cache_failures: counter(
+                "rayherd_job_cache_failures_total",
+                "copies that the workers' caches could not keep, or have lost",
+                &JOB,
+            )?,
+        })
+    }
+
+    fn observe(&self, labels: [&str; 2], spec: &RenderJobSpec, state: &State, tally: &Tally, local: bool) {
+        let [namespace, job] = labels;
+        let scene = |k: Kind| matches!(k, Kind::Geometry | Kind::Attributes | Kind::Texture);
+        let read = |place: Place| tally.bytes.sum(|_, o, k, p| o == Op::Read && p == place && scene(k));
+        let (near, far) = (read(Place::Local), read(Place::Remote));
+        // where no store is on a node of ours there is no near
+        if local && near + far > 0 {
+            self.remote.with_label_values(&labels).set(far as f64 / (near + far) as f64);
+        }
+        for row in tally.bytes.rows() {
+            // the names that reports use
+            let name = |v: serde_json::Result<serde_json::Value>| match v {
+                Ok(serde_json::Value::String(s)) => s,
+                _ => String::new(),
+            };
+            let (stage, op) = (name(serde_json::to_value(row.stage)), name(serde_json::to_value(row.op)));
+            let (kind, place) = (name(serde_json::to_value(row.kind)), name(serde_json::to_value(row.place)));
+            raise(&self.bytes.with_label_values(&[namespace, job, &stage, &op, &kind, &place]), row.bytes);
+        }
+        raise(&self.cpu.with_label_values(&labels), tally.cpu);
+        let rays = state.rays();
+        let kinds =
+            [("camera", rays.camera), ("closest", rays.closest), ("shadow", rays.shadow), ("merged", rays.merged)];
+        for (kind, count) in kinds {
+            raise(&self.rays.with_label_values(&[namespace, job, kind]), count);
+        }
+        raise(&self.hops.with_label_values(&labels), tally.hops);
+        raise(&self.cache_failures.with_label_values(&labels), tally.cache_failures);
+        for outcome in Outcome::ALL {
+            let count = tally.outcomes.get(&outcome).copied().unwrap_or(0);
+            raise(&self.tasks.with_label_values(&[namespace, job, outcome.name()]), count);
+        }
+        let slots = spec.workers.slots_per_node(1).unwrap_or_default();
+        for (number, of_worker) in &tally.by_worker {
+            let labels = [namespace, job, &number.to_string()];
+            raise(&self.worker_cpu.with_label_values(&labels), of_worker.cpu);
+            let slots = slots.get(*number as usize).copied().unwrap_or(1);
+            self.worker_slots.with_label_values(&labels).set(f64::from(slots));
+            self.resident.with_label_values(&labels).set(of_worker.resident as f64);
+        }
+        self.rounds.with_label_values(&labels).set(state.status.rounds as f64);
+        self.queued.with_label_values(&labels).set(tally.queued as f64);
+        self.running.with_label_values(&labels).set(tally.running as f64);
+        self.waiting.with_label_values(&labels).set(state.status.waiting as f64);
+        // one that has ended asks for none: those that are kept warm are no job's that is stuck
+        let ended = state.end.is_some();
+        let wanted = if ended { 0 } else { state.wanted.map_or(slots.len(), |n| n as usize) };
+        self.workers.with_label_values(&labels).set(if ended { 0.0 } else { f64::from(tally.ready) });
+        self.wanted.with_label_values(&labels).set(wanted as f64);
+        self.slots.with_label_values(&labels).set(slots.iter().take(wanted).map(|&s| f64::from(s)).sum());
+        let frames = spec.image.cameras.len().max(1);
+        let is_done = matches!(&state.end, Some((_, Ok(()))));
+        self.progress.with_label_values(&labels).set(if is_done { 1.0 } else { state.progress(frames) });
+        self.degraded.with_label_values(&labels).set(f64::from(u8::from(state.below.is_some())));
+        if let Some(error) = state.reports.last().and_then(|r| r.rel_mse) {
+            self.error.with_label_values(&labels).set(error);
+        }
+    }
+
+    fn forget(&self, namespace: &str, job: &str) {
+        let of = [namespace, job];
+        for family in [&self.cpu, &self.worker_cpu] {
+            drop_labels(family, of);
+        }
+        for family in [&self.bytes, &self.rays, &self.hops, &self.tasks, &self.cache_failures] {
+            drop_labels(family, of);
+        }
+        let gauges = [
+            &self.worker_slots,
+            &self.resident,
+            &self.remote,
+            &self.rounds,
+            &self.queued,
+            &self.running,
+            &self.waiting,
+            &self.workers,
+            &self.wanted,
+            &self.slots,
+            &self.progress,
+            &self.degraded,
+            &self.error,
+        ];
+        for family in gauges {
+            drop_labels(family, of);
+        }
+    }
+}
+
+/// Raises a counter to what was counted. Where that is less, it was begun anew, and so is the counter.
+fn raise<P: Atomic>(counter: &GenericCounter<P>, to: P::T)
+where
+    P::T: PartialOrd + std::ops::Sub<Output = P::T> + Copy,
+{
+    if counter.get() > to {
+        counter.reset();
+    }
+    counter.inc_by(to - counter.get());
+}
+
+/// Removes all of a family that has these labels `namespace` and `job`.
+fn drop_labels<T: MetricVecBuilder>(family: &MetricVec<T>, [namespace, job]: [&str; 2]) {
+    for shown in family.collect() {
+        for metric in shown.get_metric() {
+            let labels: HashMap<&str, &str> = metric.get_label().iter().map(|l| (l.name(), l.value())).collect();
+            if labels.get("namespace") == Some(&namespace) && labels.get("job") == Some(&job) {
+                // it is there: it was just shown
+                let _ = family.remove(&labels);
+            }
+        }
+    }
+}
+
 /// Serves `/metrics`, and `/healthz` for the kubelet.
 pub async fn serve(context: Arc<Context>) -> anyhow::Result<()> {
     let listener = tokio::net::TcpListener::bind(context.config.metrics).await?;
-    let metrics = |State(context): State<Arc<Context>>| async move { context.metrics.text().unwrap_or_default() };
+    let metrics = |Given(context): Given<Arc<Context>>| async move { context.metrics.text().unwrap_or_default() };
     let router = Router::new().route("/metrics", get(metrics)).route("/healthz", get(health));
     Ok(axum::serve(listener, router.with_state(context)).await?)
 }
 
 #[cfg(test)]
 mod tests {
+    use rayherd_herd::remote::fleet::WorkerTally;
+    use rayherd_herd::report::{Report, Stage};
+
     use super::*;
 
     /// Words of a text that look like a metric's name, without the ends that a histogram adds.
@@ -256,16 +366,8 @@ mod tests {
     fn alerts_and_dashboard_name_metrics_that_exist() {
         let metrics = Metrics::new().unwrap();
         // a family without a value is not shown
-        for gauge in
-            [&metrics.cpu, &metrics.remote, &metrics.rounds, &metrics.tasks, &metrics.waiting, &metrics.workers]
-        {
-            gauge.with_label_values(&["n", "j"]).set(1.0);
-        }
-        for gauge in [&metrics.wanted, &metrics.slots, &metrics.progress, &metrics.degraded, &metrics.error] {
-            gauge.with_label_values(&["n", "j"]).set(1.0);
-        }
-        metrics.cache_failures.with_label_values(&["n", "j"]).set(1.0);
-        metrics.bytes.with_label_values(&["n", "j", "trace", "read", "geometry", "local"]).set(1.0);
+        observed(&metrics, "j", 1);
+        metrics.asked.with_label_values(&["get"]).inc();
         let shown = metrics.text().unwrap();
         let exist: Vec<&str> = shown.lines().filter_map(|l| l.strip_prefix("# TYPE ")?.split(' ').next()).collect();
         let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/../charts/rayherd/monitoring");
@@ -273,6 +375,11 @@ mod tests {
         let dashboard = std::fs::read_to_string(format!("{folder}/dashboard.json")).unwrap();
         let rules: serde_json::Value = serde_yaml::from_str(&rules).unwrap();
         let dashboard: serde_json::Value = serde_json::from_str(&dashboard).unwrap();
+        let types: Vec<(&str, &str)> =
+            shown.lines().filter_map(|l| l.strip_prefix("# TYPE ")?.split_once(' ')).collect();
+        for (name, kind) in types {
+            assert_eq!(name.ends_with("_total"), kind == "counter", "{name} is a {kind}");
+        }
         let alerts = rules["groups"][0]["rules"].as_array().unwrap();
         let panels = dashboard["panels"].as_array().unwrap();
         assert!((6..=10).contains(&alerts.len()) && panels.len() > 8);
@@ -287,59 +394,70 @@ mod tests {
                 count += 1;
             }
         }
-        assert!(count > 18, "{count}");
+        assert!(count > 26, "{count}");
         // else Prometheus puts its own labels of these names in the place of ours, and no alert names its job
         let template = format!("{folder}/../templates/monitoring.yaml");
         assert!(std::fs::read_to_string(template).unwrap().contains("honorLabels: true"));
     }
 
-    #[test]
-    fn workers_of_a_job_that_is_over_are_wanted_no_more() {
-        let metrics = Metrics::new().unwrap();
-        let storage = rayherd_herd::remote::Storage { bucket: "b".into(), region: "r".into(), ..Default::default() };
-        let running = Running {
-            generation: 1,
-            spec: rayherd_api::RenderJobSpec::default(),
-            fleet: rayherd_herd::remote::Fleet::new(1, "e"),
-            storage: storage.into(),
-            state: Default::default(),
-        };
-        let wanted = || metrics.wanted.with_label_values(&["n", "a"]).get();
-        metrics.observe("n", "a", &running);
-        assert_eq!(wanted(), 1.0);
-        running.lock().end = Some((k8s_openapi::jiff::Timestamp::UNIX_EPOCH, Ok(())));
-        metrics.observe("n", "a", &running);
-        assert_eq!((wanted(), metrics.slots.with_label_values(&["n", "a"]).get()), (0.0, 0.0));
+    /// Tells all there is to tell of a job; how much was counted of it is a multiple of `n`.
+    fn observed(metrics: &Metrics, job: &str, n: u64) {
+        let mut tally = Tally { ready: 1, cpu: n as f64, hops: 3 * n, queued: 2, running: 1, ..Tally::default() };
+        tally.bytes.add(Stage::Trace, Op::Read, Kind::Geometry, Place::Local, 7 * n);
+        tally.outcomes.insert(Outcome::Made, 4 * n);
+        tally.by_worker.insert(1, WorkerTally { cpu: n as f64, resident: 100 });
+        let mut state = State { wanted: Some(2), ..State::default() };
+        state.status.rays.shadow = n;
+        state.reports.push(Report { rel_mse: Some(0.1), ..Report::default() });
+        let mut spec = RenderJobSpec::default();
+        spec.workers.slots = vec![2, 3];
+        metrics.of_jobs.observe(["n", job], &spec, &state, &tally, true);
     }
 
     #[test]
-    fn names_are_unique_and_ended_jobs_leave_no_labels() {
+    fn ended_jobs_leave_no_labels() {
         let metrics = Metrics::new().unwrap();
         for job in ["a", "b"] {
-            for gauge in [
-                &metrics.cpu,
-                &metrics.remote,
-                &metrics.rounds,
-                &metrics.tasks,
-                &metrics.waiting,
-                &metrics.workers,
-                &metrics.wanted,
-                &metrics.slots,
-                &metrics.progress,
-                &metrics.degraded,
-                &metrics.error,
-            ] {
-                gauge.with_label_values(&["n", job]).set(1.5);
-            }
-            metrics.bytes.with_label_values(&["n", job, "trace", "read", "geometry", "local"]).set(7.0);
+            observed(&metrics, job, 1);
         }
-        // no family of jobs is left out
-        let text = metrics.text().unwrap();
-        let families = text.lines().filter(|l| l.starts_with("# TYPE rayherd_job_")).count();
-        assert_eq!((text.matches("job=\"a\"").count(), families), (12, 12), "{text}");
+        let count = |job: &str| metrics.text().unwrap().matches(&format!("job=\"{job}\"")).count();
+        // each family at least once
+        let families = metrics.registry.gather();
+        let of_jobs = |f: &&prometheus::proto::MetricFamily| {
+            f.name().starts_with("rayherd_job_") || f.name().starts_with("rayherd_worker_")
+        };
+        let of_jobs = families
+            .iter()
+            .filter(of_jobs)
+            .filter(|f| f.get_metric().iter().any(|m| m.get_label().iter().any(|l| l.name() == "job")));
+        assert_eq!(of_jobs.count(), 19, "one that is not told of here may stay");
+        assert!(count("a") >= 19 && count("a") == count("b"));
+        let before = count("b");
         metrics.forget("n", "a");
+        assert_eq!((count("a"), count("b")), (0, before), "{}", metrics.text().unwrap());
+        assert!(metrics.text().unwrap().contains("rayherd_reconcile_errors_total 0"));
+    }
+
+    #[test]
+    fn counters_only_rise_and_begin_anew_with_a_job_that_does() {
+        let metrics = Metrics::new().unwrap();
+        for (n, hops) in [(1, 3), (2, 6), (2, 6), (1, 3)] {
+            observed(&metrics, "j", n);
+            let text = metrics.text().unwrap();
+            let hops = format!("rayherd_job_hops_total{{job=\"j\",namespace=\"n\"}} {hops}\n");
+            assert!(text.contains(&hops), "{text}");
+        }
         let text = metrics.text().unwrap();
-        assert_eq!((text.matches("job=\"a\"").count(), text.matches("job=\"b\"").count()), (0, 12), "{text}");
-        assert!(text.contains("rayherd_reconcile_errors_total 0"));
+        for line in [
+            "rayherd_job_rays_total{job=\"j\",kind=\"shadow\",namespace=\"n\"} 1\n",
+            "rayherd_job_tasks_total{job=\"j\",namespace=\"n\",outcome=\"made\"} 4\n",
+            "rayherd_worker_cpu_seconds_total{job=\"j\",namespace=\"n\",worker=\"1\"} 1\n",
+            "rayherd_worker_slots{job=\"j\",namespace=\"n\",worker=\"1\"} 3\n",
+            "rayherd_worker_resident_bytes{job=\"j\",namespace=\"n\",worker=\"1\"} 100\n",
+            "rayherd_job_queue_depth{job=\"j\",namespace=\"n\"} 2\n",
+            "rayherd_job_workers_wanted{job=\"j\",namespace=\"n\"} 2\n",
+        ] {
+            assert!(text.contains(line), "{line}: {text}");
+        }
     }
 }

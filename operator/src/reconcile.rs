@@ -17,7 +17,7 @@ use kube::runtime::controller::Action;
 use kube::runtime::events::{Event, EventType, Recorder, Reporter};
 use kube::{Api, Client, Resource, ResourceExt};
 use rayherd_api::resource::{RenderJobObject, RenderJobStatus};
-use rayherd_api::{RenderJobSpec, validate};
+use rayherd_api::{MANAGED_BY, RenderJobSpec, validate};
 use rayherd_herd::remote::{Storage, Turns};
 use rayherd_herd::store::StoreError;
 use serde_json::json;
@@ -81,15 +81,12 @@ pub struct Context {
 
 impl Context {
     /// Nothing runs yet.
-    ///
-    /// # Errors
-    /// When a metric cannot be registered, which a test excludes.
-    pub fn new(client: Client, config: Config) -> anyhow::Result<Self> {
+    pub fn new(client: Client, config: Config, metrics: Metrics) -> Self {
         let (jobs, trusted, turns, left) = (Jobs::default(), RwLock::default(), Arc::default(), Arc::default());
         let reporter = Reporter { controller: "rayherd-operator".into(), instance: Some(config.pod.clone()) };
         let events = Recorder::new(client.clone(), reporter);
-        let (failures, watching, metrics) = (Failures::default(), Watching::default(), Metrics::new()?);
-        Ok(Context { client, config, jobs, trusted, turns, left, failures, watching, events, metrics })
+        let (failures, watching) = (Failures::default(), Watching::default());
+        Context { client, config, jobs, trusted, turns, left, failures, watching, events, metrics }
     }
     /// Objects of every namespace that is watched.
     pub fn everywhere<K>(&self) -> Api<K>
@@ -172,6 +169,10 @@ pub async fn reconcile(job: Arc<Seen>, context: Arc<Context>) -> Result<Action, 
 }
 
 async fn step(job: &Arc<RenderJobObject>, context: &Arc<Context>) -> Result<Action, Error> {
+    // somebody else's: nothing is made of it, and nothing said
+    if job.spec.managed_by.as_deref().is_some_and(|m| m != MANAGED_BY) {
+        return Ok(Action::await_change());
+    }
     let namespace = job.namespace().unwrap_or_default();
     let uid = job.metadata.uid.clone().unwrap_or_default();
     let jobs: Api<Seen> = Api::namespaced(context.client.clone(), &namespace);
@@ -415,7 +416,7 @@ async fn keep_pods(
         (state.held.clone(), state.scene.is_some(), state.known && fresh)
     };
     // until it is known where the scene's blocks are, one worker prepares it
-    let wanted = if prepared { build::slots(job).len() as u32 } else { 1 };
+    let wanted = if prepared { follow(job, running) } else { 1 };
     let mut plan = if waits && !prepared {
         build::Plan::default()
     } else {
@@ -504,6 +505,14 @@ fn newly_killed(state: &mut State, kills: Vec<Kill>) -> Vec<Kill> {
     let seen: BTreeSet<String> = kills.iter().map(|k| k.id.clone()).collect();
     let Some(known) = state.killed.replace(seen) else { return Vec::new() };
     kills.into_iter().filter(|k| !known.contains(&k.id)).collect()
+}
+
+/// How many workers a job is to have now; noted, where that follows the work.
+fn follow(job: &RenderJobObject, running: &Running) -> u32 {
+    let mut state = running.lock();
+    let wanted = build::wanted(job, state.to_do(), state.wanted);
+    state.wanted = job.spec.workers.max.map(|_| wanted);
+    wanted
 }
 
 /// Pods as JSON: what a job's template says of them goes to the API server as it is, which knows what is right.

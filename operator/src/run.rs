@@ -18,8 +18,8 @@ use rayherd_scene::objects::ObjectRef;
 use tokio::runtime::Handle;
 
 use crate::build;
-use crate::jobs::{Problem, Running, State};
-use crate::ledger::Ledger;
+use crate::jobs::{Before, Problem, Running, State};
+use crate::ledger::{Beside, Ledger};
 
 /// A store that is silent for so long is lost, and what lies on it is copied again: longer than a server takes to start anew.
 const LOST: Duration = Duration::from_secs(15);
@@ -47,8 +47,11 @@ pub fn pictures(job: &RenderJobObject) -> Vec<String> {
     numbered.collect()
 }
 
-/// The manifest of a job's scene, if the status has one of the settings as they are now.
+/// The manifest of a job's scene, if its spec names it, or the status has one of the settings as they are now.
 pub fn known_scene(job: &RenderJobObject) -> Option<String> {
+    if job.spec.scene.prepared.is_some() {
+        return job.spec.scene.prepared.clone();
+    }
     let status = job.status.as_ref()?;
     let settings = status.scene_settings.as_ref()?;
     status.scene.clone().filter(|_| *settings == scene_settings(&job.spec))
@@ -68,7 +71,15 @@ pub fn start(
     let session = format!("o{nanos:x}");
     let known = known_scene(&job);
     let (pods, held) = before.map(|b| b.lock()).map(|b| (b.pods.clone(), b.held.clone())).unwrap_or_default();
-    let begun = State { started: Some(Timestamp::now()), known: known.is_some(), pods, held, ..State::default() };
+    let begun = State {
+        started: Some(Timestamp::now()),
+        known: known.is_some(),
+        before: Before::of(&job),
+        wanted: before.and_then(|b| b.lock().wanted),
+        pods,
+        held,
+        ..State::default()
+    };
     let running = Arc::new(Running {
         generation: job.metadata.generation.unwrap_or(0),
         spec: job.spec.clone(),
@@ -76,7 +87,13 @@ pub fn start(
         storage: storage.into(),
         state: begun.into(),
     });
-    let keeper = Kept { ledger: Ledger::new(client, &job, Handle::current()), running: running.clone() };
+    let beside = Beside {
+        depot: depot.clone(),
+        replicas: job.spec.replicas.map_or(1, |r| r.max(1) as u32),
+        prefix: prefix(job.metadata.uid.as_deref().unwrap_or_default()),
+    };
+    let ledger = Ledger::new(client, &job, Handle::current(), beside);
+    let keeper = Kept { ledger, running: running.clone() };
     let runtime = Handle::current();
     let of_thread = running.clone();
     let name = job.metadata.name.clone().unwrap_or_default();
@@ -130,7 +147,7 @@ struct Kept {
 }
 
 impl Keeper for Kept {
-    fn newest(&self, frame: u32) -> Option<(u64, String)> {
+    fn newest(&self, frame: u32) -> Result<Option<(u64, String)>, JobError> {
         self.ledger.newest(frame)
     }
     fn move_to(&self, frame: u32, sequence: u64, name: &str) -> Result<(), JobError> {
@@ -153,10 +170,8 @@ impl Keeper for Kept {
         }
     }
     fn done(&self, _: u32, picture: &[String], report: &Report) {
-        let mut state = self.running.lock();
         // one address of each picture is enough
-        state.pictures.extend(picture.first().cloned());
-        state.reports.push(report.clone());
+        self.running.lock().done(picture.first().cloned(), report.clone());
     }
 }
 

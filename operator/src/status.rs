@@ -113,7 +113,7 @@ pub fn news<'s>(known: Option<&RenderJobStatus>, status: &'s RenderJobStatus) ->
 /// A job runs here, or has run.
 pub fn running(job: &RenderJobObject, running: &Running, now: Timestamp) -> RenderJobStatus {
     let (state, tally) = (running.lock().clone(), running.fleet.tally());
-    let wanted = crate::build::slots(job).len();
+    let wanted = state.wanted.map_or_else(|| crate::build::slots(job).len(), |n| n as usize);
     of(job, &state, &tally, wanted, running.is_local(), now)
 }
 
@@ -135,8 +135,9 @@ fn of(
     };
     status.phase = Some(phase.into());
     let s = &state.status;
-    if let Some(percent) = (s.samples * 100).checked_div(s.samples_total) {
-        status.progress = Some(format!("{}%", percent.min(100)));
+    let frames = job.spec.image.cameras.len().max(1);
+    if s.samples_total > 0 {
+        status.progress = Some(format!("{}%", (state.progress(frames) * 100.0) as u32));
     }
     if phase == "Complete" {
         status.progress = Some("100%".into());
@@ -147,11 +148,13 @@ fn of(
     status.rays_waiting = Some(s.waiting as i64);
     let scene = |k: Kind| matches!(k, Kind::Geometry | Kind::Attributes | Kind::Texture);
     let read = |place: Place| tally.bytes.sum(|_, o, k, p| o == Op::Read && p == place && scene(k));
-    let (near, far) = (read(Place::Local), read(Place::Remote));
-    if local && near + far > 0 {
-        status.remote_read_ratio = Some(format!("{:.3}", far as f64 / (near + far) as f64));
+    let (near, far) = (read(Place::Local) as i64, read(Place::Remote) as i64);
+    let [all, far] = [state.before.read[0] + near + far, state.before.read[1] + far];
+    if local && all > 0 {
+        (status.scene_bytes_read, status.scene_bytes_remote) = (Some(all), Some(far));
+        status.remote_read_ratio = Some(format!("{:.3}", far as f64 / all as f64));
     }
-    status.cpu_seconds = Some(tally.cpu as i64);
+    status.cpu_seconds = Some(state.before.cpu + tally.cpu as i64);
     let ready = if matches!(phase, "Complete" | "Failed") { 0 } else { tally.ready };
     status.workers = Some(format!("{ready}/{wanted}"));
     if let Some(scene) = &state.scene {
@@ -164,10 +167,13 @@ fn of(
     status.start_time = status.start_time.filter(|_| goes_on).or(state.started.map(Time));
     status.first_task_time = status.first_task_time.filter(|_| goes_on).or(state.first_task.map(Time));
     if !state.reports.is_empty() {
-        status.tasks_redone = Some(state.reports.iter().map(|r| r.tasks_redone).sum::<u64>() as i64);
+        let redone: u64 = state.reports.iter().map(|r| r.tasks_redone).sum();
+        status.tasks_redone = Some(state.before.redone + redone as i64);
+        status.frames_done = Some(state.reports.len() as i64);
     }
-    if !state.pictures.is_empty() {
-        status.pictures.clone_from(&state.pictures);
+    if let Some(picture) = &state.picture {
+        let folder = picture.rsplit_once('/').filter(|_| frames > 1).map(|(folder, _)| format!("{folder}/"));
+        status.output = Some(folder.unwrap_or_else(|| picture.clone()));
     }
     set(job, &mut status, "Accepted", "True", "Valid", "the job can run", now);
     let has = |kind: &str| status.conditions.iter().any(|c| c.type_ == kind && c.status == "True");
@@ -256,6 +262,7 @@ pub fn is_finished(job: &RenderJobObject) -> bool {
 
 #[cfg(test)]
 mod tests {
+    use rayherd_herd::report::{Report, Stage};
     use serde_json::json;
 
     use super::*;
@@ -320,6 +327,61 @@ mod tests {
             let status = of(&job(json!({})), &State::default(), &tally, 1, local, at(0));
             assert_eq!((status.locality.as_deref(), status.remote_read_ratio.as_deref()), (Some(locality), ratio));
         }
+    }
+
+    #[test]
+    fn progress_is_of_all_frames_and_the_status_does_not_grow_with_them() {
+        let mut three = job(json!({}));
+        let camera = json!({"origin": [0, 0, 1], "target": [0, 0, 0], "fov": 40});
+        three.spec.image.cameras = serde_json::from_value(json!([camera, camera, camera])).unwrap();
+        let mut state = State { scene: Some("s".into()), ..State::default() };
+        (state.status.samples, state.status.samples_total) = (50, 100);
+        let told = |state: &State| of(&three, state, &Tally::default(), 1, true, at(0));
+        assert_eq!(told(&state).progress.as_deref(), Some("16%"));
+        state.status.rays.closest = 7;
+        state.status.samples = 100;
+        let report = Report { rays: state.status.rays, ..Report::default() };
+        state.done(Some("http://s/b/output/n/j/j-1.exr".into()), report);
+        assert_eq!(told(&state).progress.as_deref(), Some("33%"), "not counted twice");
+        assert_eq!(state.rays().closest, 7);
+        let size = |status: &RenderJobStatus| serde_json::to_string(status).unwrap().len();
+        let one = size(&told(&state));
+        (state.status.samples, state.status.samples_total) = (50, 100);
+        assert_eq!(told(&state).progress.as_deref(), Some("50%"));
+        state.done(Some("http://s/b/output/n/j/j-2.exr".into()), Report::default());
+        let two = told(&state);
+        assert_eq!((two.frames_done, two.output.as_deref()), (Some(2), Some("http://s/b/output/n/j/")));
+        assert_eq!(size(&two), one);
+        let single = job(json!({}));
+        let status = of(&single, &state, &Tally::default(), 1, true, at(0));
+        assert_eq!(status.output.as_deref(), Some("http://s/b/output/n/j/j-2.exr"));
+    }
+
+    #[test]
+    fn what_was_counted_goes_on_over_failover_suspension_and_more_samples() {
+        let new = job(json!({}));
+        let mut tally = Tally { cpu: 10.5, ..Tally::default() };
+        tally.bytes.add(Stage::Trace, Op::Read, Kind::Geometry, Place::Local, 75);
+        tally.bytes.add(Stage::Trace, Op::Read, Kind::Geometry, Place::Remote, 25);
+        let report = Report { tasks_redone: 2, ..Report::default() };
+        let mut state = State { reports: vec![report], ..State::default() };
+        let counted = |s: &RenderJobStatus| (s.cpu_seconds, s.tasks_redone, s.remote_read_ratio.clone());
+        let first = of(&new, &state, &tally, 1, true, at(0));
+        assert_eq!(counted(&first), (Some(10), Some(2), Some("0.250".into())));
+        // another operator, or the next spec, which has done nothing yet, after a rest
+        let slept = suspended(&job(serde_json::to_value(&first).unwrap()), at(1));
+        assert_eq!(counted(&slept), counted(&first));
+        let next = job(serde_json::to_value(&slept).unwrap());
+        state = State { before: crate::jobs::Before::of(&next), ..State::default() };
+        assert_eq!(counted(&of(&next, &state, &Tally::default(), 1, true, at(2))), counted(&first));
+        let local = Tally { cpu: 1.0, ..Tally::default() };
+        let third = of(&next, &state, &local, 1, true, at(2));
+        assert_eq!(third.cpu_seconds, Some(11));
+        tally.bytes.add(Stage::Trace, Op::Read, Kind::Geometry, Place::Local, 100);
+        assert_eq!(of(&next, &state, &tally, 1, true, at(2)).remote_read_ratio.as_deref(), Some("0.167"));
+        // told twice, counted once
+        let again = of(&job(serde_json::to_value(&third).unwrap()), &state, &local, 1, true, at(2));
+        assert_eq!(again, third);
     }
 
     #[test]

@@ -10,12 +10,16 @@ use kube::client::Body;
 use kube::runtime::controller::Action;
 use rayherd_api::resource::RenderJobObject;
 use rayherd_herd::job::JobError;
+use rayherd_herd::remote::Depot;
+use rayherd_herd::store::{BlockStore, MemoryStore};
 use serde_json::{Value, json};
 use tokio::runtime::Handle;
+use tower::Layer;
 use tower_test::mock::{self, Handle as Mock};
 
 use crate::config::Config;
-use crate::ledger::Ledger;
+use crate::ledger::{Beside, Ledger};
+use crate::metrics::Metrics;
 use crate::reconcile::{Context, FINALIZER, Seen, reconcile};
 
 /// One request that must come, and its answer.
@@ -87,7 +91,9 @@ fn context() -> (Arc<Context>, Server) {
         metrics: "127.0.0.1:0".parse().unwrap(),
         watch: None,
     };
-    (Arc::new(Context::new(Client::new(service, "default"), config).unwrap()), server)
+    let metrics = Metrics::new().unwrap();
+    let service = metrics.requests().layer(service);
+    (Arc::new(Context::new(Client::new(service, "default"), config, metrics)), server)
 }
 
 fn job() -> Value {
@@ -167,6 +173,32 @@ async fn a_job_without_its_storage_waits_and_says_for_what() {
     told["status"] = said[1]["status"].clone();
     let (done, ..) = scenario(&told, vec![step("GET", PROFILE, 404, not_found())]).await;
     assert_ne!(done.unwrap(), Action::await_change(), "told once, and looked at again");
+}
+
+#[tokio::test]
+async fn a_job_that_somebody_else_manages_is_left_alone() {
+    let mut theirs = job();
+    theirs["spec"]["managedBy"] = json!("kueue.x-k8s.io/multikueue");
+    // whatever there is to say of it
+    theirs["spec"]["sampling"] = json!({"spp": 0});
+    let (done, _, context) = scenario(&theirs, vec![]).await;
+    assert_eq!(done, Ok(Action::await_change()));
+    assert!(context.jobs.get("u-1").is_none());
+    theirs["metadata"]["deletionTimestamp"] = json!("2026-01-01T00:00:00Z");
+    theirs["metadata"]["finalizers"] = json!([FINALIZER]);
+    let (done, ..) = scenario(&theirs, vec![]).await;
+    assert_eq!(done, Ok(Action::await_change()), "also when another operator of its kind has it");
+    let mut ours = theirs.clone();
+    ours["spec"]["managedBy"] = json!(rayherd_api::MANAGED_BY);
+    ours["metadata"]["finalizers"] = json!([]);
+    ours["metadata"]["deletionTimestamp"] = Value::Null;
+    let tell = step("PATCH", STATUS, 200, ours.clone()).with("/status/phase", json!("Failed"));
+    let (done, _, context) = scenario(&ours, vec![tell, event("Warning", "Invalid")]).await;
+    assert_eq!(done, Ok(Action::await_change()));
+    // what was asked of the API server is counted
+    let text = context.metrics.text().unwrap();
+    assert!(text.contains("rayherd_api_requests_total{verb=\"patch\"} 1"), "{text}");
+    assert!(text.contains("rayherd_api_requests_total{verb=\"post\"} 1"), "{text}");
 }
 
 #[tokio::test]
@@ -423,12 +455,64 @@ async fn moved(steps: Vec<Step>) -> (Result<(), JobError>, Option<(u64, String)>
     let client = Client::new(service, "default");
     let mut known = job();
     known["status"] = json!({"ledger": [{"frame": 0, "sequence": 4, "record": "four"}]});
-    let ledger = Arc::new(Ledger::new(client, &object(&known), Handle::current()));
+    let ledger = Arc::new(Ledger::new(client, &object(&known), Handle::current(), beside(&stores())));
     let serving = tokio::spawn(serve(server, steps));
     let of_thread = ledger.clone();
     let result = tokio::task::spawn_blocking(move || of_thread.move_to(0, 5, "five")).await.unwrap();
     serving.await.unwrap();
-    (result, ledger.newest(0))
+    (result, tokio::task::spawn_blocking(move || ledger.newest(0)).await.unwrap().unwrap())
+}
+
+fn stores() -> Vec<Arc<MemoryStore>> {
+    (0..2).map(|_| Arc::new(MemoryStore::default())).collect()
+}
+
+fn beside(stores: &[Arc<MemoryStore>]) -> Beside {
+    let stores = stores.iter().map(|s| s.clone() as Arc<dyn BlockStore>).collect();
+    Beside { depot: Depot::new(stores, None).unwrap(), replicas: 2, prefix: "jobs/u-1".into() }
+}
+
+#[tokio::test]
+async fn pointers_of_many_frames_take_no_more_room_than_those_of_a_few() {
+    let (service, server) = mock::pair::<Request<Body>, Response<Body>>();
+    let frames = 100;
+    let steps = (0..frames).map(|_| step("PATCH", STATUS, 200, at(0, "x", "8"))).collect();
+    let serving = tokio::spawn(serve(server, steps));
+    let stores = stores();
+    let client = Client::new(service, "default");
+    let ledger = Ledger::new(client.clone(), &object(&job()), Handle::current(), beside(&stores));
+    let moves = move || {
+        for frame in 0..frames {
+            ledger.move_to(frame, 10 + u64::from(frame), &format!("record-{frame}")).unwrap();
+            let newest = ledger.newest(frame / 2).unwrap();
+            assert_eq!(newest, Some((10 + u64::from(frame / 2), format!("record-{}", frame / 2))));
+        }
+        assert_eq!(ledger.newest(frames).unwrap(), None);
+    };
+    tokio::task::spawn_blocking(moves).await.unwrap();
+    let said = serving.await.unwrap();
+    let most = said.iter().map(|s| s["status"]["ledger"].as_array().unwrap().len()).max();
+    assert_eq!(most, Some(33), "32, and the object with the others");
+    // another operator goes on from the status
+    let mut known = job();
+    known["status"] = said[99]["status"].clone();
+    let anew = |job: &Value| Ledger::new(client.clone(), &object(job), Handle::current(), beside(&stores));
+    let (full, empty) = (anew(&known), anew(&known));
+    let look = move || {
+        for frame in 0..frames {
+            assert_eq!(full.newest(frame).unwrap(), Some((10 + u64::from(frame), format!("record-{frame}"))));
+        }
+    };
+    tokio::task::spawn_blocking(look).await.unwrap();
+    // no copy left: what the status itself says is known still
+    for store in &stores {
+        let keys: Vec<String> = store.list("jobs/u-1/pointers/").await.unwrap().into_iter().map(|(k, _)| k).collect();
+        assert!(!keys.is_empty());
+        store.delete(&keys).await.unwrap();
+    }
+    let look = move || (empty.newest(0).unwrap(), empty.newest(frames - 1).unwrap());
+    let found = tokio::task::spawn_blocking(look).await.unwrap();
+    assert_eq!(found, (None, Some((109, "record-99".to_owned()))));
 }
 
 fn at(sequence: i64, record: &str, version: &str) -> Value {

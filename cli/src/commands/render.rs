@@ -224,6 +224,7 @@ fn job(arguments: &Arguments) -> anyhow::Result<RenderJob> {
     let spec = &mut job.spec;
     if let Some(scene) = arguments.scene.as_ref().or(arguments.local.as_ref()) {
         spec.scene.source.clone_from(scene);
+        spec.scene.prepared = None;
     }
     arguments.scene_options.apply(spec);
     arguments.cut.apply(spec);

@@ -1,7 +1,7 @@
 //! From the spec of a checked job to what importing, preparing and tracing are told: the same for a local run and for a
 //! cluster, so that both make the same bytes.
 
-use rayherd_api::{self as api, CameraSpec, LightSpec, RenderJobSpec, Strategy};
+use rayherd_api::{self as api, CameraSpec, LightSpec, RenderJobSpec, StorageSpec, Strategy};
 use rayherd_render::aov::{Aov, Aovs};
 use rayherd_render::camera::{Camera, View};
 use rayherd_render::filter::Filter;
@@ -61,12 +61,17 @@ pub fn prepare_settings(spec: &RenderJobSpec) -> PrepareSettings {
 /// Names what the prepared scene of a job depends on, but for the source's content: two jobs of one name and an unchanged source
 /// have one prepared scene.
 pub fn scene_settings(spec: &RenderJobSpec) -> String {
+    // the API server fills in what others leave out
+    let storage = StorageSpec {
+        profile: spec.storage.profile.clone().filter(|p| p != "default"),
+        secret: spec.storage.secret.clone().filter(|s| s != "rayherd-storage"),
+    };
     let settings = json!({
         "scene": spec.scene,
         "size": spec.image.size,
         "cut": prepare_settings(spec),
-        "storage": spec.storage,
-        "replicas": spec.replicas,
+        "storage": storage,
+        "replicas": spec.replicas.filter(|&r| r != 1),
     });
     blake3::hash(settings.to_string().as_bytes()).to_hex()[..32].to_owned()
 }
@@ -137,5 +142,21 @@ pub fn definition(manifest: &Manifest, frame: &Frame, spp: u32) -> Result<Map<St
     match json!({ "scene": manifest.content, "frame": frame, "spp": spp }) {
         Value::Object(map) => Ok(map),
         _ => Err(JobError::Internal("the definition of an image is no object".into())),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn defaults_that_the_api_server_writes_out_are_no_other_settings() {
+        let mut spec = RenderJobSpec::default();
+        let name = scene_settings(&spec);
+        spec.storage = StorageSpec { profile: Some("default".into()), secret: Some("rayherd-storage".into()) };
+        (spec.replicas, spec.overlap_threshold) = (Some(1), Some(0.2));
+        assert_eq!(scene_settings(&spec), name);
+        spec.replicas = Some(2);
+        assert_ne!(scene_settings(&spec), name);
     }
 }

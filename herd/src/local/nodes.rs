@@ -138,6 +138,10 @@ impl<'a> Nodes<'a> {
     pub fn memory(&self, node: u32) -> &Memory {
         &self.memories[node as usize]
     }
+    /// Bytes of scene data that all nodes of this process hold in memory.
+    pub fn resident(&self) -> u64 {
+        self.memories.iter().map(Memory::held).sum()
+    }
     /// A node's texture tiles.
     pub fn tiles(&self, node: u32) -> &TileCache {
         &self.tiles[node as usize]

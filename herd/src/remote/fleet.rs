@@ -65,6 +65,9 @@ struct State {
     bytes: Bytes,
     cpu: f64,
     cache_failures: u64,
+    hops: u64,
+    outcomes: BTreeMap<Outcome, u64>,
+    by_worker: BTreeMap<u32, WorkerTally>,
     /// Splits and texture tiles that somebody has read in this stage.
     read: [BTreeSet<u32>; 2],
     first_attempt: Option<Instant>,
@@ -107,6 +110,55 @@ enum What {
     Call { call: u64, work: Work },
 }
 
+/// How an attempt at a task ended.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Outcome {
+    /// With a result.
+    Made,
+    /// It was given back, or another one had done the task.
+    Stopped,
+    /// Its worker went away.
+    Gone,
+    /// What it was to work on was lost.
+    Lost,
+    /// It failed.
+    Failed,
+}
+
+impl Outcome {
+    /// All of them.
+    pub const ALL: [Outcome; 5] = [Outcome::Made, Outcome::Stopped, Outcome::Gone, Outcome::Lost, Outcome::Failed];
+
+    /// Its name in metrics.
+    pub fn name(self) -> &'static str {
+        match self {
+            Outcome::Made => "made",
+            Outcome::Stopped => "stopped",
+            Outcome::Gone => "gone",
+            Outcome::Lost => "lost",
+            Outcome::Failed => "failed",
+        }
+    }
+
+    fn of(result: &Result<Done, Failure>) -> Self {
+        match result {
+            Ok(_) => Outcome::Made,
+            Err(Failure::Stopped) => Outcome::Stopped,
+            Err(Failure::Lost { .. }) => Outcome::Lost,
+            Err(Failure::ForNow { .. } | Failure::ForGood { .. }) => Outcome::Failed,
+        }
+    }
+}
+
+/// What one worker has done so far.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct WorkerTally {
+    /// CPU-seconds of its work.
+    pub cpu: f64,
+    /// Bytes of scene data that it held in memory when it reported last.
+    pub resident: u64,
+}
+
 /// What a fleet has done so far, for the status of its job.
 #[derive(Clone, Debug, Default)]
 pub struct Tally {
@@ -118,6 +170,16 @@ pub struct Tally {
     pub cpu: f64,
     /// Copies that workers' caches could not keep, or have lost.
     pub cache_failures: u64,
+    /// Rays that left a task for a split that it did not hold.
+    pub hops: u64,
+    /// Attempts that ended, by how.
+    pub outcomes: BTreeMap<Outcome, u64>,
+    /// By worker.
+    pub by_worker: BTreeMap<u32, WorkerTally>,
+    /// Work that nobody has taken yet.
+    pub queued: u64,
+    /// Work in workers' hands.
+    pub running: u64,
     /// When the first attempt was handed out.
     pub first_attempt: Option<Instant>,
 }
@@ -178,8 +240,19 @@ impl Fleet {
     pub fn tally(&self) -> Tally {
         let state = self.lock();
         let ready = state.workers.iter().flatten().filter(|w| w.seen.elapsed() < SILENCE).count() as u32;
-        let State { cpu, cache_failures, first_attempt, .. } = *state;
-        Tally { ready, bytes: state.bytes.clone(), cpu, cache_failures, first_attempt }
+        let ready_work: usize = state.workers.iter().flatten().map(|w| w.ready.len()).sum();
+        Tally {
+            ready,
+            bytes: state.bytes.clone(),
+            cpu: state.cpu,
+            cache_failures: state.cache_failures,
+            hops: state.hops,
+            outcomes: state.outcomes.clone(),
+            by_worker: state.by_worker.clone(),
+            queued: (state.common.len() + ready_work) as u64,
+            running: state.doing.len() as u64,
+            first_attempt: state.first_attempt,
+        }
     }
     /// How many of the splits and of the texture tiles nobody has read since the stage began, of so many.
     pub fn never_read(&self, all: [usize; 2]) -> [u64; 2] {
@@ -329,6 +402,9 @@ impl Fleet {
         if !matches!(report.result, Err(Failure::Stopped)) {
             state.deaths.came_out(report.worker.number, &doing.held.keys);
         }
+        let of_worker = state.by_worker.entry(report.worker.number).or_default();
+        of_worker.cpu += report.cpu;
+        of_worker.resident = report.resident;
         // by the name that the stage had before memory was taken away
         if state.stage.is_some() && report.reads.stage.split('+').next() == Some(&state.whole.0) {
             state.read[0].extend(report.reads.splits);
@@ -339,6 +415,10 @@ impl Fleet {
         }
         match (doing.what, report.result) {
             (What::Attempt { task, number, .. }, result) => {
+                *state.outcomes.entry(Outcome::of(&result)).or_default() += 1;
+                if let Ok(Done::Made { hops, .. }) = &result {
+                    state.hops += hops;
+                }
                 let result = state.judge(result);
                 state.finished.push_back(Finished { task, number, result, cpu: report.cpu, bytes });
             }
@@ -554,6 +634,9 @@ impl State {
     /// A worker is gone: what it did is lost, what any worker can do is done by another. Whether it was there.
     fn leave(&mut self, number: u32) -> bool {
         let Some(worker) = self.workers.get_mut(number as usize).and_then(Option::take) else { return false };
+        if let Some(tally) = self.by_worker.get_mut(&number) {
+            tally.resident = 0;
+        }
         self.emptied.insert(number);
         let held = self.doing.values().filter(|d| d.worker == number).map(|d| d.held.clone()).collect();
         self.deaths.left(number, &worker.session, held);
@@ -573,6 +656,7 @@ impl State {
     }
 
     fn lose(&mut self, task: TaskId, number: u32) {
+        *self.outcomes.entry(Outcome::Gone).or_default() += 1;
         let (result, bytes) = (Err(JobError::Stopped), Bytes::default());
         self.finished.push_back(Finished { task, number, result, cpu: 0.0, bytes });
     }

@@ -30,7 +30,10 @@ const GATHER: Duration = Duration::from_secs(3);
 /// Whoever keeps the state of a job where it outlives the operator.
 pub trait Keeper: Send + Sync {
     /// The newest record of a frame that counts: its place in the chain and its name.
-    fn newest(&self, frame: u32) -> Option<(u64, String)>;
+    ///
+    /// # Errors
+    /// When that cannot be looked up for now.
+    fn newest(&self, frame: u32) -> Result<Option<(u64, String)>, JobError>;
     /// Moves the pointer of a frame to a record that is durable.
     ///
     /// # Errors
@@ -92,9 +95,16 @@ fn frames(job: &Job, keeper: &Arc<dyn Keeper>, progress: &dyn Progress) -> Resul
             "spec.replicas is {replicas}, but the storage has {servers} server(s): ask for at most one copy on each"
         )));
     }
-    let (reference, reused, cells_passed) = match known(job, replicas)? {
-        Some(known) => (known, true, 0),
-        None => prepared(job, replicas)?,
+    let (reference, reused, cells_passed) = match (known(job, replicas)?, &spec.scene.prepared) {
+        (Some(known), _) => (known, true, 0),
+        (None, Some(hash)) => {
+            return Err(JobError::Settings(format!(
+                "spec.scene.prepared: {} has no prepared scene {hash}: name spec.scene.source instead, or the hash that status.scene of \
+                 a job of this storage says",
+                job.depot.replicated(replicas)?.describe()
+            )));
+        }
+        (None, None) => prepared(job, replicas)?,
     };
     keeper.prepared(&reference, reused);
     let store = Arc::new(job.depot.replicated(replicas)?);
@@ -161,7 +171,7 @@ fn known(job: &Job, replicas: u32) -> Result<Option<ObjectRef>, JobError> {
     let store = job.depot.replicated(replicas)?;
     match job.runtime.block_on(store.size(&object_key(&hash))) {
         Ok(size) => Ok(size.map(|bytes| ObjectRef { hash, bytes })),
-        Err(e @ StoreError::Unavailable { .. }) => {
+        Err(e @ StoreError::Unavailable { .. }) if job.spec.scene.prepared.is_none() => {
             tracing::warn!("{e}: the scene is prepared again");
             Ok(None)
         }
@@ -200,7 +210,7 @@ fn render(
         buckets: stage.buckets,
     };
     let image = scene.image_name(&stage.frame)?;
-    let states = resume(&shared.nodes, &image, &journal::scope(scene, &stage.frame), keeper.newest(number))?;
+    let states = resume(&shared.nodes, &image, &journal::scope(scene, &stage.frame), keeper.newest(number)?)?;
     let pointer = FramePointer { keeper: keeper.clone(), frame: number };
     // where nobody looks where data lies, nobody holds any
     let places = if stage.near { places.to_vec() } else { vec![Vec::new(); places.len()] };

@@ -173,6 +173,9 @@ pub struct Report {
     /// Copies that its cache could not keep, or has lost, since it told last.
     #[serde(default)]
     pub cache_failures: u64,
+    /// Bytes of scene data that it holds in memory.
+    #[serde(default)]
+    pub resident: u64,
 }
 
 /// Objects of a scene that a worker has read in a stage, and has not told of before.

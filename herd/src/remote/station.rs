@@ -303,8 +303,9 @@ impl<'l> Station<'l> {
         let (splits, tiles) = open.map(|o| o.shared.nodes.take_reads()).unwrap_or_default();
         let reads = Reads { stage: open.map(|o| o.stage.id.clone()).unwrap_or_default(), splits, tiles };
         let cache_failures = self.copies.as_ref().map_or(0, |c| c.take_failures());
+        let resident = open.map_or(0, |o| o.shared.nodes.resident());
         let (worker, holds) = (self.worker.clone(), open.and_then(Opened::holds));
-        let report = Report { worker, id: id.clone(), result, cpu, bytes, reads, holds, cache_failures };
+        let report = Report { worker, id: id.clone(), result, cpu, bytes, reads, holds, cache_failures, resident };
         let since = Instant::now();
         while let Err(e) = self.link.report(&report) {
             tracing::warn!("{e}");

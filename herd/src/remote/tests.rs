@@ -92,8 +92,8 @@ struct Kept {
 }
 
 impl Keeper for Kept {
-    fn newest(&self, frame: u32) -> Option<(u64, String)> {
-        self.pointers.lock().unwrap().get(&frame).cloned()
+    fn newest(&self, frame: u32) -> Result<Option<(u64, String)>, JobError> {
+        Ok(self.pointers.lock().unwrap().get(&frame).cloned())
     }
     fn move_to(&self, frame: u32, sequence: u64, name: &str) -> Result<(), JobError> {
         let old = self.pointers.lock().unwrap().insert(frame, (sequence, name.to_owned()));
@@ -353,13 +353,13 @@ fn workers_and_operators_that_go_change_no_byte() {
         let job = scope.spawn(move || run(&cluster.job(spec, depot, first, "e1"), &keeper, &Silent));
         wait_for(|| wire.attempts.load(Ordering::Relaxed) >= 4);
         stations[1].leave();
-        wait_for(|| kept.newest(0).is_some_and(|p| p.0 >= 6));
+        wait_for(|| kept.newest(0).unwrap().is_some_and(|p| p.0 >= 6));
         first.cancel("stopped by the test");
         let stopped = job.join().unwrap();
         assert!(matches!(stopped, Err(JobError::Owned(_))), "{:?}", stopped.err());
         first.end();
     });
-    let committed = kept.newest(0).unwrap().0;
+    let committed = kept.newest(0).unwrap().unwrap().0;
     assert!(committed >= 6);
     // a record that was written beyond the pointer does not count
     cluster.beside((&spec, &kept, "e2"), |job| job, |_, _| {}).unwrap();
@@ -373,7 +373,7 @@ fn begun(cluster: &Cluster, spec: &RenderJobSpec, kept: &Arc<Kept>, records: u64
         (spec, kept, "e1"),
         |job| job,
         |fleet, is_over| {
-            wait_for(|| kept.newest(0).is_some_and(|p| p.0 >= records) || is_over());
+            wait_for(|| kept.newest(0).unwrap().is_some_and(|p| p.0 >= records) || is_over());
             fleet.cancel("stopped by the test");
         },
     );
@@ -393,7 +393,7 @@ fn an_unreadable_record_or_snapshot_costs_work_and_not_the_job() {
         let (cluster, kept) = (Cluster { band, ..Cluster::new(3) }, Arc::new(Kept::default()));
         begun(&cluster, &spec, &kept, 40);
         let part = cluster.depot(None).part("jobs/1/0", 2).unwrap();
-        let (sequence, name) = kept.newest(0).unwrap();
+        let (sequence, name) = kept.newest(0).unwrap().unwrap();
         let mut records = cluster.runtime.block_on(journal::read(&part)).unwrap();
         records.retain(|n, r| r.sequence < sequence || *n == name);
         let snapshots = records.iter().filter(|r| r.1.snapshot.is_some());
@@ -503,21 +503,27 @@ fn a_worker_that_comes_back_under_another_session_loses_only_its_tasks() {
                 non_finite: vec![],
                 picture: vec![],
             }),
-            cpu: 0.0,
+            cpu: 0.5,
             bytes: vec![],
             reads: Default::default(),
             holds: None,
             cache_failures: 0,
+            resident: 5,
         };
         assert_eq!(fleet.report(report("b", &first, Some(1.0))), Ok(false), "its id is known no more");
         assert_eq!(fleet.report(report("b", "other-0", Some(2.0))), Ok(false));
         let beat = Beat { worker: poll("b").worker, running: vec![first.clone(), second.clone()] };
         assert_eq!(fleet.beat(&beat), Ok(vec![first]));
+        assert_eq!((fleet.tally().running, fleet.tally().queued), (1, 0));
         assert_eq!(fleet.report(report("b", &second, Some(3.0))), Ok(true));
         assert_eq!(fleet.report(report("b", &second, Some(4.0))), Ok(false), "a replay");
+        let tally = fleet.tally();
+        assert_eq!(tally.by_worker.get(&0), Some(&super::fleet::WorkerTally { cpu: 0.5, resident: 5 }), "counted once");
+        assert_eq!((tally.cpu, tally.running, tally.queued), (0.5, 0, 0));
         let done = call.join().unwrap().unwrap();
         assert!(matches!(done, super::message::Done::Merged { rel_mse: Some(x), .. } if x == 3.0));
     });
+    assert_eq!(fleet.tally().outcomes, Default::default(), "there was no attempt");
     // the loop over rounds learns that the one that came back holds nothing
     let told = fleet.next(Duration::ZERO).unwrap();
     assert!(matches!(told, Some(Event::MemoryLost(0))) && fleet.next(Duration::ZERO).unwrap().is_none());
@@ -565,7 +571,7 @@ fn a_store_that_goes_while_rays_wait_costs_copies_and_no_byte() {
         (&spec, &kept, "e"),
         |job| job,
         |_, _| {
-            wait_for(|| kept.newest(0).is_some_and(|p| p.0 >= 3));
+            wait_for(|| kept.newest(0).unwrap().is_some_and(|p| p.0 >= 3));
             cluster.stores[1].lose();
         },
     );
@@ -585,7 +591,7 @@ fn a_machine_whose_plug_is_pulled_costs_its_copies_and_no_byte() {
         (&spec, &kept, "e"),
         |job| Job { patience: Duration::ZERO, ..job },
         |_, _| {
-            wait_for(|| kept.newest(0).is_some_and(|p| p.0 >= 3));
+            wait_for(|| kept.newest(0).unwrap().is_some_and(|p| p.0 >= 3));
             cluster.stores[1].hang(true);
         },
     );
@@ -618,7 +624,7 @@ fn a_server_that_comes_back_without_its_bucket_costs_its_copies_and_no_byte() {
         // far longer than the test may take: it is no silence
         |job| Job { patience: Duration::from_secs(3600), ..job },
         |_, _| {
-            wait_for(|| kept.newest(0).is_some_and(|p| p.0 >= 3));
+            wait_for(|| kept.newest(0).unwrap().is_some_and(|p| p.0 >= 3));
             cluster.stores[1].empty();
         },
     );
@@ -662,8 +668,30 @@ fn a_job_whose_scene_is_known_needs_its_source_no_more() {
     };
     assert!(again(None).unwrap_err().to_string().contains("upload the scene first"));
     cluster.runtime.block_on(cluster.stores[0].delete(&["out/a.exr".to_owned()])).unwrap();
-    again(Some(scene)).unwrap();
+    again(Some(scene.clone())).unwrap();
     assert!(cluster.picture(0) == expected(&spec));
+    // another job that names it by its hash alone
+    let mut named = spec.clone();
+    (named.scene.source, named.scene.prepared, named.splits) = (String::new(), Some(scene.clone()), None);
+    let by_name = |known: &str| {
+        let (kept, known) = (Arc::new(Kept::default()), Some(known.to_owned()));
+        let done = cluster.beside((&named, &kept, "g"), |job| Job { known, prefix: "jobs/3".into(), ..job }, |_, _| {});
+        (done, kept)
+    };
+    cluster.runtime.block_on(cluster.stores[0].delete(&["out/a.exr".to_owned()])).unwrap();
+    let (done, kept) = by_name(&scene);
+    done.unwrap();
+    assert!(kept.prepared.lock().unwrap()[0].1, "nothing was prepared");
+    assert!(cluster.picture(0) == expected(&spec));
+    let absent = "0".repeat(64);
+    named.scene.prepared = Some(absent.clone());
+    let by_name = cluster.beside(
+        (&named, &Arc::new(Kept::default()), "h"),
+        |job| Job { known: Some(absent.clone()), prefix: "jobs/4".into(), ..job },
+        |_, _| {},
+    );
+    let error = by_name.unwrap_err().to_string();
+    assert!(error.contains("has no prepared scene 0000") && error.contains("status.scene"), "{error}");
 }
 
 #[test]
