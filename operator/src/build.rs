@@ -373,6 +373,20 @@ pub fn plan(job: &str, pods: &[Pod], wanted: u32, (held, placement): (&BTreeMap<
     plan
 }
 
+/// Pods of workers that cannot do what their job asks for, if others would be made of another image: they make room for these.
+pub fn outdated<'p>(pods: &'p [Pod], unfit: &[u32], made: &Value) -> Vec<&'p str> {
+    let containers = made.pointer("/spec/containers").and_then(Value::as_array);
+    let worker = containers.and_then(|c| c.iter().find(|c| c["name"] == "worker"));
+    let image = worker.and_then(|c| c["image"].as_str());
+    let is_other = |pod: &&Pod| {
+        let containers = pod.spec.iter().flat_map(|s| &s.containers);
+        containers.filter(|c| c.name == "worker").any(|c| c.image.is_some() && c.image.as_deref() != image)
+    };
+    let living = pods.iter().filter(|p| p.metadata.deletion_timestamp.is_none());
+    let unfit = living.filter(|p| number(p).is_some_and(|n| unfit.contains(&n)));
+    unfit.filter(is_other).filter_map(|p| p.metadata.name.as_deref()).collect()
+}
+
 /// The number of a pod's worker.
 pub fn number(pod: &Pod) -> Option<u32> {
     pod.metadata.labels.as_ref()?.get(NUMBER)?.parse().ok()
@@ -663,6 +677,27 @@ mod tests {
         let mut new = old.clone();
         new.workers.slots = vec![3];
         assert!(!same_workers(&old, &new));
+    }
+
+    #[test]
+    fn workers_of_another_image_make_room_when_they_cannot_do_the_job() {
+        let there = |name: &str, number: &str, image: &str| -> Pod {
+            serde_json::from_value(json!({
+                "metadata": {"name": name, "labels": {NUMBER: number}},
+                "spec": {"containers": [{"name": "beside", "image": "b:1"}, {"name": "worker", "image": image}]},
+            }))
+            .unwrap()
+        };
+        let mut going = there("a-w3", "3", "worker:0");
+        going.metadata.deletion_timestamp = serde_json::from_value(json!("2026-01-01T00:00:00Z")).unwrap();
+        let pods =
+            [there("a-w0", "0", "worker:0"), there("a-w1", "1", "worker:0"), there("a-w2", "2", "worker:1"), going];
+        let storage =
+            Storage { bucket: "b".into(), prefix: String::new(), region: "r".into(), endpoints: vec![], cache: 0 };
+        let made = pod(&job(), &config(), &storage, &BTreeMap::new(), "PEM", 0, "a").unwrap();
+        // another one of that image would be no better, and one that can do it stays
+        assert_eq!(outdated(&pods, &[0, 2, 3], &made), ["a-w0"]);
+        assert_eq!(outdated(&pods, &[], &made), [""; 0]);
     }
 
     #[test]

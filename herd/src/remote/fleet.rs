@@ -86,6 +86,8 @@ struct Worker {
     open: bool,
     /// It can take a band out of a film part.
     bands: bool,
+    /// It was told of that it cannot do what the stage asks for.
+    unfit: bool,
     /// What its cache holds of the current stage's scene.
     holds: Holds,
 }
@@ -210,7 +212,7 @@ impl Fleet {
         state.emptied.clear();
         for worker in state.workers.iter_mut().flatten() {
             // the splits of another scene may have these numbers now
-            (worker.open, worker.holds) = (false, Holds::default());
+            (worker.open, worker.unfit, worker.holds) = (false, false, Holds::default());
         }
         self.wanted.notify_waiters();
     }
@@ -261,7 +263,12 @@ impl Fleet {
     }
     /// Whether all workers that are there can take a band out of a film part.
     pub fn knows_bands(&self) -> bool {
-        self.lock().workers.iter().flatten().all(|w| w.bands)
+        self.lock().workers.iter().flatten().all(|w| w.bands || w.unfit)
+    }
+    /// Workers that are there and cannot do what the stage asks for: of a version that knows no layers beside the picture.
+    pub fn unfit(&self) -> Vec<u32> {
+        let state = self.lock();
+        (0..).zip(&state.workers).filter(|(_, w)| w.as_ref().is_some_and(|w| w.unfit)).map(|(n, _)| n).collect()
     }
     /// The store on the node of each worker, where known.
     pub fn homes(&self) -> Vec<Option<u32>> {
@@ -353,6 +360,11 @@ impl Fleet {
         }
         if state.over {
             return Ok(Answer::Over);
+        }
+        let unfit = !poll.aovs && state.stage.as_ref().is_some_and(|s| !s.frame.aovs.is_empty());
+        if unfit {
+            state.set_unfit(poll.worker.number);
+            return Ok(Answer::Wait);
         }
         if state.stage.as_ref().map(|s| &s.id) != poll.stage.as_ref() {
             return Ok(Answer::Open { stage: state.stage.clone().map(Box::new) });
@@ -550,14 +562,14 @@ impl Fleet {
         }
     }
 
-    /// Waits until all workers have the stage open, or so long.
+    /// Waits until all workers that can have the stage open, or so long.
     ///
     /// # Errors
     /// When the job was cancelled meanwhile.
     pub fn gather(&self, patience: Duration) -> Result<(), JobError> {
         let end = Instant::now() + patience;
         let mut state = self.lock();
-        while Instant::now() < end && !state.workers.iter().all(|w| w.as_ref().is_some_and(|w| w.open)) {
+        while Instant::now() < end && !state.workers.iter().all(|w| w.as_ref().is_some_and(|w| w.open || w.unfit)) {
             state.check()?;
             state = self.wait(state, Duration::from_millis(50));
         }
@@ -622,7 +634,8 @@ impl State {
             }
             let (session, seen) = (worker.session.clone(), Instant::now());
             let (ready, holds) = (VecDeque::new(), Holds::default());
-            self.workers[number] = Some(Worker { session, home, seen, ready, open: false, bands: true, holds });
+            let worker = Worker { session, home, seen, ready, open: false, bands: true, unfit: false, holds };
+            self.workers[number] = Some(worker);
         }
         if let Some(w) = &mut self.workers[number] {
             w.seen = Instant::now();
@@ -659,6 +672,17 @@ impl State {
         *self.outcomes.entry(Outcome::Gone).or_default() += 1;
         let (result, bytes) = (Err(JobError::Stopped), Bytes::default());
         self.finished.push_back(Finished { task, number, result, cpu: 0.0, bytes });
+    }
+
+    /// A worker cannot do what the stage asks for, and would not say so: it gets nothing to do.
+    fn set_unfit(&mut self, number: u32) {
+        let worker = self.workers[number as usize].as_mut();
+        if worker.is_some_and(|w| !std::mem::replace(&mut w.unfit, true)) {
+            tracing::warn!(
+                "worker {number} is of a version that knows no layers beside the picture, which the job asks for: it gets nothing to do until \
+                 its pod is made again of the current version"
+            );
+        }
     }
 
     /// Lets silent workers go; whether there were any.

@@ -37,6 +37,9 @@ pub struct Poll {
     /// It can take a band out of a film part; workers of earlier versions add all of it.
     #[serde(default)]
     pub bands: bool,
+    /// It makes the layers that a frame asks for; workers of earlier versions leave them out, and say nothing.
+    #[serde(default)]
+    pub aovs: bool,
     /// What its cache holds of the stage's scene, if it has one.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub holds: Option<Holds>,

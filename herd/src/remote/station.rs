@@ -263,6 +263,7 @@ impl<'l> Station<'l> {
                 stage: open.map(|o| o.stage.id.clone()),
                 clerk,
                 bands: true,
+                aovs: true,
                 holds: open.and_then(Opened::holds),
             };
             match self.link.poll(&poll) {

@@ -323,7 +323,8 @@ fn a_job_without_workers_keeps_no_other_from_preparing_their_scene() {
         let waits = scope.spawn(move || run(&cluster.job(spec, depot, first, "f"), &keeper, &Silent));
         // nor one whose worker was there, and is gone with the work in its hands
         let gone = WorkerId { number: 0, session: "gone".into() };
-        let poll = Poll { worker: gone.clone(), home: None, stage: None, clerk: false, bands: true, holds: None };
+        let poll =
+            Poll { worker: gone.clone(), home: None, stage: None, clerk: false, bands: true, aovs: true, holds: None };
         wait_for(|| matches!(first.answer(&poll), Ok(Answer::Work { .. })));
         first.gone(&gone);
         cluster.render(spec, &kept).unwrap();
@@ -472,6 +473,7 @@ fn a_worker_that_comes_back_under_another_session_loses_only_its_tasks() {
         stage: None,
         clerk: false,
         bands: true,
+        aovs: true,
         holds: None,
     };
     assert_eq!(fleet.answer(&poll("a")), Ok(Answer::Wait));
@@ -536,8 +538,16 @@ fn a_worker_that_knows_no_bands_is_given_none() {
     let fleet = Fleet::new(2, "e");
     let poll = |number: u32, bands: bool| {
         let worker = WorkerId { number, session: "a".into() };
-        let text =
-            serde_json::to_value(Poll { worker, home: None, stage: None, clerk: false, bands, holds: None }).unwrap();
+        let text = serde_json::to_value(Poll {
+            worker,
+            home: None,
+            stage: None,
+            clerk: false,
+            bands,
+            aovs: true,
+            holds: None,
+        })
+        .unwrap();
         // as it is written where the word is not known
         let serde_json::Value::Object(mut map) = text else { unreachable!() };
         if !bands {
@@ -561,6 +571,65 @@ fn a_worker_that_knows_no_bands_is_given_none() {
         fleet.cancel("enough");
         assert!(matches!(call.join().unwrap(), Err(JobError::Owned(_))));
     });
+}
+
+/// A worker of a version without AOVs, as its polls are written where the word is not known.
+struct Old<'a>(&'a Wire<'a>, Mutex<Vec<super::Work>>);
+
+impl Link for Old<'_> {
+    fn poll(&self, poll: &Poll) -> Result<Answer, LinkError> {
+        let mut written = serde_json::to_value(poll).unwrap();
+        assert!(written.as_object_mut().unwrap().remove("aovs").is_some());
+        let answer = self.0.poll(&serde_json::from_value(written).unwrap())?;
+        if let Answer::Work { work, .. } = &answer {
+            self.1.lock().unwrap().push((**work).clone());
+        }
+        Ok(answer)
+    }
+    fn report(&self, report: &Report) -> Result<(), LinkError> {
+        self.0.report(report)
+    }
+    fn beat(&self, beat: &Beat) -> Result<Vec<String>, LinkError> {
+        self.0.beat(beat)
+    }
+}
+
+/// It would leave the layers out without a word: of a job that asks for some it gets nothing, of another one its share.
+#[test]
+fn a_worker_that_knows_no_layers_works_only_for_jobs_without() {
+    for layers in [true, false] {
+        let mut spec = spec(Strategy::SchedulingGridOverlapReduced, 4, 2);
+        spec.image.aovs = spec.image.aovs.filter(|_| layers);
+        let (cluster, kept) = (Cluster { band: 1, ..Cluster::new(3) }, Arc::new(Kept::default()));
+        let (fleet, depot) = (Fleet::new(3, "e"), cluster.depot(None));
+        let wire = cluster.wire(&fleet);
+        let old = Old(&wire, Mutex::default());
+        std::thread::scope(|scope| {
+            let aside = Station::new(
+                &old,
+                cluster.depot(Some(0)),
+                1,
+                WorkerId { number: 0, session: "s".into() },
+                cluster.scratch.path().to_owned(),
+            );
+            scope.spawn(move || aside.unwrap().run().unwrap());
+            for number in 1..3 {
+                let station = cluster.station(&wire, number, "s", Some(number));
+                scope.spawn(move || station.run().unwrap());
+            }
+            let keeper: Arc<dyn Keeper> = kept.clone();
+            let result = run(&cluster.job(&spec, &depot, &fleet, "e"), &keeper, &Silent);
+            assert_eq!(fleet.unfit(), if layers { vec![0] } else { vec![] });
+            assert_eq!(fleet.is_up(0), !layers);
+            fleet.end();
+            result.unwrap();
+        });
+        assert!(cluster.picture(1) == expected(&spec), "layers: {layers}");
+        let works = old.1.into_inner().unwrap();
+        // a scene is the same with and without
+        let of_stage = works.iter().filter(|w| !matches!(w, super::Work::Prepare { .. })).count();
+        assert_eq!(of_stage == 0, layers, "{works:?}");
+    }
 }
 
 #[test]
@@ -699,7 +768,7 @@ fn workers_that_wait_are_sent_to_the_next_fleet_at_once() {
     let runtime = Runtime::new().unwrap();
     let fleet = Fleet::new(1, "e");
     let worker = WorkerId { number: 0, session: "a".into() };
-    let poll = Poll { worker, home: None, stage: None, clerk: false, bands: true, holds: None };
+    let poll = Poll { worker, home: None, stage: None, clerk: false, bands: true, aovs: true, holds: None };
     // far longer than a test may take
     let waits = runtime.block_on(async {
         let waiting = fleet.poll(&poll, Duration::from_secs(3600));

@@ -66,6 +66,8 @@ fn two_pictures(
 fn a_cache_of_any_size_or_none_changes_no_byte_and_a_large_one_reads_all_once() {
     let mut spec = spec(Strategy::SchedulingGridOverlapReduced, 4, 1);
     spec.workers.memory = Some("2000".parse().unwrap());
+    spec.image.size = Some("24x20".parse().unwrap());
+    spec.task_seconds = Some(0.05);
     let want = expected(&spec);
     let folder = tempfile::tempdir().unwrap();
     let not_a_folder = folder.path().join("file");
@@ -230,7 +232,9 @@ fn of_what_a_cache_holds_the_latest_word_counts() {
     let holds = |version: u64, runs: &[[u32; 2]]| Some(Holds { version, splits: runs.to_vec() });
     let say = |stage: &str, holds: Option<Holds>| {
         let (stage, home) = (Some(stage.into()), None);
-        fleet.answer(&over(&Poll { worker: worker(), home, stage, clerk: false, bands: true, holds })).unwrap()
+        fleet
+            .answer(&over(&Poll { worker: worker(), home, stage, clerk: false, bands: true, aovs: true, holds }))
+            .unwrap()
     };
     let held = || fleet.holders().unwrap().iter().map(|on| !on.is_empty()).collect::<Vec<_>>();
     open("one");
