@@ -692,8 +692,7 @@ mod tests {
         going.metadata.deletion_timestamp = serde_json::from_value(json!("2026-01-01T00:00:00Z")).unwrap();
         let pods =
             [there("a-w0", "0", "worker:0"), there("a-w1", "1", "worker:0"), there("a-w2", "2", "worker:1"), going];
-        let storage =
-            Storage { bucket: "b".into(), prefix: String::new(), region: "r".into(), endpoints: vec![], cache: 0 };
+        let storage = Storage { bucket: "b".into(), region: "r".into(), ..Storage::default() };
         let made = pod(&job(), &config(), &storage, &BTreeMap::new(), "PEM", 0, "a").unwrap();
         // another one of that image would be no better, and one that can do it stays
         assert_eq!(outdated(&pods, &[0, 2, 3], &made), ["a-w0"]);

@@ -450,7 +450,7 @@ async fn keep_pods(
     let trusted = context.trusted.read().unwrap_or_else(PoisonError::into_inner).clone();
     let unfit = running.fleet.unfit();
     if let Some(&first) = unfit.first() {
-        let made = build::pod(job, &context.config, &running.storage, &held, &trusted, first, "");
+        let made = build::pod(job, &context.config, &running.storage(), &held, &trusted, first, "");
         let made = made.map_err(|e| Error::Internal(e.to_string()))?;
         for name in build::outdated(&found, &unfit, &made) {
             tracing::info!(pod = name, "a worker of another version cannot do the job: another takes its place");

@@ -791,7 +791,8 @@ impl Hand<'_> {
         let since = Instant::now();
         loop {
             let worker = WorkerId { number: 0, session: session.into() };
-            let poll = Poll { worker, home: None, stage: stage.clone(), clerk: false, bands: true, aovs: true, holds: None };
+            let poll =
+                Poll { worker, home: None, stage: stage.clone(), clerk: false, bands: true, aovs: true, holds: None };
             match self.0.answer(&poll).unwrap() {
                 Answer::Open { stage: now } => (memory, stage) = now.map_or((None, None), |s| (s.memory, Some(s.id))),
                 Answer::Work { work, .. } => return (memory, *work),
