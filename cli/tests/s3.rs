@@ -115,10 +115,10 @@ fn no_cluster(folder: &Path) -> String {
     path.to_str().unwrap().to_owned()
 }
 
-/// Uploads a scene as `submit` does, and renders a job of it from there by its profile: the same bytes as from the local file.
 /// Runs the program in a folder, with these arguments and variables.
 type Runs<'a> = &'a dyn Fn(&Path, &[&str], &[(&str, &str)]) -> Run;
 
+/// Uploads a scene as `submit` does, and renders a job of it from there by its profile: the same bytes as from the local file.
 fn a_scene_goes_there_and_comes_back(store: &str, profile: &str, run: Runs) {
     let folder = tempfile::tempdir().unwrap();
     let folder = folder.path();
