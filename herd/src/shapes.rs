@@ -2,6 +2,9 @@
 
 use rayherd_render::memory::prefetch;
 
+/// Most parts of a guide, within the room that [`crate::resident::top_bytes`] leaves beside a block's trees.
+const MOST_PARTS: usize = 1024;
+
 /// Shapes by primitive: by runs, whose tables stay in near caches where a number each misses the last one at each hit; or a number each
 /// when these are fewer bytes.
 pub(crate) enum Shapes {
@@ -16,7 +19,7 @@ pub(crate) struct Runs {
     starts: Vec<u32>,
     /// Shape of each run.
     shapes: Vec<u32>,
-    /// For each of equal parts of the primitives how many runs end before it, so that a search takes a step or two.
+    /// For each of equal parts of the primitives how many runs end before it, and one more: so that a search takes a step or two.
     guide: Vec<u32>,
     /// Primitives of a part, as a shift.
     shift: u32,
@@ -25,8 +28,8 @@ pub(crate) struct Runs {
 impl Shapes {
     pub(crate) fn new(each: Vec<u32>) -> Shapes {
         let count = each.chunk_by(|a, b| a == b).count();
-        // two numbers a run and a quarter of one for each primitive
-        if 2 * count + each.len().div_ceil(4) > each.len() {
+        // two numbers a run, and a part of the guide for four primitives
+        if 2 * count + each.len().div_ceil(4) >= each.len() {
             return Shapes::Each(each);
         }
         let (mut starts, mut shapes) = (Vec::with_capacity(count.saturating_sub(1)), Vec::with_capacity(count));
@@ -38,10 +41,11 @@ impl Shapes {
                 starts.push(at as u32);
             }
         }
-        // about two parts to a run; parts of four primitives at least, so that all of it is less than a number each
-        let shift = (each.len() / (2 * count).max(1)).max(4).next_power_of_two().trailing_zeros();
+        // about two parts to a run; of four primitives at least
+        let parts = (2 * count).clamp(1, MOST_PARTS);
+        let shift = (each.len() / parts).max(4).next_power_of_two().trailing_zeros();
         let part = |k: usize| starts.partition_point(|&start| start as usize <= k << shift) as u32;
-        let guide = (0..each.len().div_ceil(1 << shift)).map(part).collect();
+        let guide = (0..=each.len().div_ceil(1 << shift)).map(part).collect();
         Shapes::Runs(Runs { starts, shapes, guide, shift })
     }
 
@@ -50,10 +54,9 @@ impl Shapes {
         match self {
             Shapes::Each(shapes) => shapes[primitive],
             Shapes::Runs(Runs { starts, shapes, guide, shift }) => {
-                let mut run = guide[primitive >> shift] as usize;
-                while starts.get(run).is_some_and(|&start| start as usize <= primitive) {
-                    run += 1;
-                }
+                let part = primitive >> shift;
+                let (first, last) = (guide[part] as usize, guide[part + 1] as usize);
+                let run = first + starts[first..last].partition_point(|&start| start as usize <= primitive);
                 shapes[run]
             }
         }
