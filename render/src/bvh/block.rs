@@ -5,7 +5,7 @@
 //! | byte | what |
 //! |---|---|
 //! | 0 | magic, 8 bytes: `RHGEOM\r\n` |
-//! | 8 | u32 version, 1 |
+//! | 8 | u32 version, 2; 1 is the same with each triangle in one leaf |
 //! | 12 | u32 number of triangles |
 //! | 16 | u32 number of spheres |
 //! | 20 | u32 root of the triangles' tree, bytes / 32 in the arena, or 2^32 - 1 without triangles (else 0) |
@@ -27,11 +27,14 @@
 use super::collapse::{Content, Plan};
 use super::ids::Ids;
 use super::layout::*;
+use super::parts::Parts;
 use super::{Fork, sah};
 use crate::ray::PrimId;
 
 pub(super) const MAGIC: [u8; 8] = *b"RHGEOM\r\n";
-pub(super) const VERSION: u32 = 1;
+pub(super) const VERSION: u32 = 2;
+/// The oldest that is read.
+pub(super) const OLDEST: u32 = 1;
 /// Bytes before the arena.
 pub(super) const HEADER: usize = 128;
 /// In place of a root when there is no tree.
@@ -117,10 +120,11 @@ pub fn build_block(
         }
     }
 
-    let triangle_tree = (!triangles.is_empty()).then(|| sah::build(triangles.iter().map(Aabb::of_triangle), fork));
+    let parts = Parts::new(triangles);
+    let triangle_tree = (!triangles.is_empty()).then(|| sah::build(parts.boxes(), fork));
     let sphere_tree =
         (!spheres.is_empty()).then(|| sah::build(spheres.iter().map(|s| Aabb::of_sphere(s.center, s.radius)), fork));
-    let triangle_content = Triangles(triangles);
+    let triangle_content = Triangles { triangles, parts: &parts };
     let sphere_content = Spheres { spheres, first: triangles.len() as u32 };
     let triangle_plan = triangle_tree.as_ref().map(|tree| Plan::new(tree, &triangle_content, fork));
     let sphere_plan = sphere_tree.as_ref().map(|tree| Plan::new(tree, &sphere_content, fork));
@@ -186,21 +190,44 @@ fn check_ids(primitives: usize, ids: &[PrimId]) -> Result<(), BuildError> {
     }
 }
 
-struct Triangles<'a>(&'a [[[f32; 3]; 3]]);
+struct Triangles<'a> {
+    triangles: &'a [[[f32; 3]; 3]],
+    parts: &'a Parts<'a>,
+}
+
+impl Triangles<'_> {
+    /// The triangles of some boxes, ascending, and how many.
+    fn of(&self, boxes: &[u32]) -> ([u32; WIDTH], usize) {
+        let mut found = [u32::MAX; WIDTH];
+        for (to, &number) in found.iter_mut().zip(boxes) {
+            *to = self.parts.triangle(number);
+        }
+        found[..boxes.len()].sort_unstable();
+        let mut count = 0;
+        for i in 0..boxes.len() {
+            if i == 0 || found[i] != found[count - 1] {
+                found[count] = found[i];
+                count += 1;
+            }
+        }
+        (found, count)
+    }
+}
 
 impl Content for Triangles<'_> {
     fn max_leaf(&self) -> u32 {
         WIDTH as u32
     }
-    fn leaf_bytes(&self, n: usize) -> usize {
-        leaf_bytes(n)
+    fn leaf_bytes(&self, boxes: &[u32]) -> usize {
+        leaf_bytes(self.of(boxes).1)
     }
     fn stack_below(&self, _: &[u32]) -> usize {
         0
     }
     fn write_leaf(&self, boxes: &[u32], out: &mut [u8], at: usize) -> u32 {
-        write_primitives(boxes, 0, out, |i, row| self.0[i as usize].as_flattened()[row].to_bits());
-        leaf_ref(at, boxes.len())
+        let (found, count) = self.of(boxes);
+        write_primitives(&found[..count], 0, out, |i, row| self.triangles[i as usize].as_flattened()[row].to_bits());
+        leaf_ref(at, count)
     }
 }
 
@@ -214,14 +241,18 @@ impl Content for Spheres<'_> {
     fn max_leaf(&self) -> u32 {
         WIDTH as u32
     }
-    fn leaf_bytes(&self, n: usize) -> usize {
-        leaf_bytes(n)
+    fn leaf_bytes(&self, boxes: &[u32]) -> usize {
+        leaf_bytes(boxes.len())
     }
     fn stack_below(&self, _: &[u32]) -> usize {
         0
     }
     fn write_leaf(&self, boxes: &[u32], out: &mut [u8], at: usize) -> u32 {
-        write_primitives(boxes, self.first, out, |i, row| {
+        let mut sorted = [u32::MAX; WIDTH];
+        let sorted = &mut sorted[..boxes.len()];
+        sorted.copy_from_slice(boxes);
+        sorted.sort_unstable();
+        write_primitives(sorted, self.first, out, |i, row| {
             let s = &self.spheres[i as usize];
             match row {
                 0..3 => s.center[row].to_bits(),
@@ -234,13 +265,10 @@ impl Content for Spheres<'_> {
     }
 }
 
-/// Writes a leaf, by ascending index.
-fn write_primitives(boxes: &[u32], first: u32, out: &mut [u8], value: impl Fn(u32, usize) -> u32) {
-    let n = boxes.len();
-    let mut sorted = [u32::MAX; WIDTH];
-    sorted[..n].copy_from_slice(boxes);
-    sorted.sort_unstable();
-    for (i, &number) in sorted[..n].iter().enumerate() {
+/// Writes a leaf of primitives by ascending index.
+fn write_primitives(sorted: &[u32], first: u32, out: &mut [u8], value: impl Fn(u32, usize) -> u32) {
+    let n = sorted.len();
+    for (i, &number) in sorted.iter().enumerate() {
         for row in 0..INDEX_ROW {
             write_u32(out, (row * n + i) * 4, value(number, row));
         }

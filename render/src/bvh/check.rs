@@ -2,9 +2,9 @@
 //!
 //! The arena has to be exactly what [`super::layout`] says, record after record, so one pass in the order of the bytes
 //! shows all of it: no record overlaps another, references go forward and form a tree, every primitive of the block
-//! stands in exactly one leaf, every box is finite and contains what is below it.
+//! stands in a leaf, every box is finite, contains the boxes below it and meets the triangles and contains the spheres there.
 
-use super::block::{HEADER, MAGIC, MAX_PRIMITIVES, NO_ROOT, Sphere, VERSION, read_sphere};
+use super::block::{HEADER, MAGIC, MAX_PRIMITIVES, NO_ROOT, OLDEST, Sphere, VERSION, read_sphere};
 use super::ids::Ids;
 use super::layout::*;
 
@@ -15,7 +15,7 @@ pub enum BlockError {
     #[error("not a geometry object: {0}")]
     Format(&'static str),
     /// Of another version: prepare the scene again.
-    #[error("geometry object of version {0}, this program reads version 1: prepare the scene again")]
+    #[error("geometry object of version {0}, this program reads 1 and 2: prepare the scene again")]
     Version(u32),
     /// The header does not fit the content.
     #[error("geometry object has a wrong header: {0}")]
@@ -84,7 +84,7 @@ pub(super) fn check<'a>(bytes: &'a [u8], visit: &mut dyn FnMut(Record)) -> Resul
     if bytes[..8] != MAGIC {
         return Err(BlockError::Format("it does not begin as one"));
     }
-    if read_u32(bytes, 8) != VERSION {
+    if !(OLDEST..=VERSION).contains(&read_u32(bytes, 8)) {
         return Err(BlockError::Version(read_u32(bytes, 8)));
     }
     let (triangles, spheres) = (read_u32(bytes, 12), read_u32(bytes, 16));
@@ -191,6 +191,14 @@ impl Pass<'_, '_> {
             }
             let mut union = Aabb::EMPTY;
             for (aabb, reference) in &slots {
+                if *reference != 0 {
+                    union = union.union(aabb);
+                }
+            }
+            if p.within.is_none() {
+                tree.aabb = union;
+            }
+            for (aabb, reference) in &slots {
                 if *reference == 0 {
                     if *aabb != Aabb::EMPTY {
                         return fail("an empty slot has a box");
@@ -200,16 +208,12 @@ impl Pass<'_, '_> {
                 if !aabb.is_sound() {
                     return fail("a box is not finite, too large or inverted");
                 }
-                union = union.union(aabb);
                 if reference & LEAF != 0 {
-                    found += self.leaf(at, *reference, aabb, kind)?;
+                    found += self.leaf(at, *reference, aabb, &tree.aabb, kind)?;
                 }
             }
             if p.within.is_some_and(|b| !b.contains(&union)) {
                 return fail("a box does not contain the boxes below it");
-            }
-            if p.within.is_none() {
-                tree.aabb = union;
             }
             for (aabb, reference) in slots.iter().rev() {
                 if *reference != 0 && reference & LEAF == 0 {
@@ -225,8 +229,15 @@ impl Pass<'_, '_> {
         Ok(tree)
     }
 
-    /// Checks a leaf: its number of primitives.
-    fn leaf(&mut self, from: usize, reference: u32, aabb: &Aabb, kind: Kind) -> Result<usize, BlockError> {
+    /// Checks a leaf: how many of its primitives were in none before.
+    fn leaf(
+        &mut self,
+        from: usize,
+        reference: u32,
+        aabb: &Aabb,
+        bounds: &Aabb,
+        kind: Kind,
+    ) -> Result<usize, BlockError> {
         let (at, n) = (self.next, leaf_len(reference));
         let fail = |what| Err(BlockError::Tree { at: from, what });
         if reference != leaf_ref(at, n) {
@@ -237,13 +248,21 @@ impl Pass<'_, '_> {
         }
         let row = |r: usize| self.arena[at + r * n * 4..][..n * 4].chunks_exact(4).map(|x| read_u32(x, 0));
         if kind.is_triangle {
-            // false for NaN as well
-            let within = |axis: usize, bits: u32| {
-                let x = f32::from_bits(bits);
-                aabb.lo[axis] <= x && x <= aabb.hi[axis]
-            };
-            if !(0..INDEX_ROW).all(|r| row(r).fold(true, |all, x| all & within(r % 3, x))) {
-                return fail("a box does not contain its primitives");
+            // a large triangle stands in several leaves, each of whose boxes holds a part of it
+            for axis in 0..3 {
+                let corners = |i: usize| {
+                    let x = |vertex: usize| read_f32(self.arena, at + ((3 * vertex + axis) * n + i) * 4);
+                    [x(0), x(1), x(2)]
+                };
+                for corners in (0..n).map(corners) {
+                    // false for NaN as well
+                    if !corners.iter().all(|&x| bounds.lo[axis] <= x && x <= bounds.hi[axis]) {
+                        return fail("a triangle passes the bounds of its tree");
+                    }
+                    if !corners.iter().any(|&x| x >= aabb.lo[axis]) || !corners.iter().any(|&x| x <= aabb.hi[axis]) {
+                        return fail("a box does not meet its triangles");
+                    }
+                }
             }
         } else {
             if row(3).any(|x| !(f32::from_bits(x) > 0.0 && f32::from_bits(x) <= MAX_COORDINATE))
@@ -262,20 +281,22 @@ impl Pass<'_, '_> {
                 }
             }
         }
-        let mut previous = None;
+        let (mut previous, mut new) = (None, 0);
         for index in row(INDEX_ROW) {
             if index < kind.first || index >= kind.end || previous.is_some_and(|p| p >= index) {
                 return fail("the index of a primitive is out of range or order");
             }
             previous = Some(index);
             let (word, bit) = (index as usize / 64, 1 << (index % 64));
-            if self.seen[word] & bit != 0 {
-                return fail("a primitive stands in two leaves");
+            let is_new = self.seen[word] & bit == 0;
+            if !is_new && !kind.is_triangle {
+                return fail("a sphere stands in two leaves");
             }
+            new += usize::from(is_new);
             self.seen[word] |= bit;
         }
         (self.visit)(Record::Leaf(at, n));
         self.next += leaf_bytes(n);
-        Ok(n)
+        Ok(new)
     }
 }

@@ -20,8 +20,8 @@ const FORK_ABOVE: u32 = 1 << 14;
 pub(super) trait Content: Sync {
     /// How many boxes may share a leaf.
     fn max_leaf(&self) -> u32;
-    /// Bytes that the record of a leaf of n boxes takes, a multiple of 32.
-    fn leaf_bytes(&self, n: usize) -> usize;
+    /// Bytes that the record of a leaf of these boxes takes, a multiple of 32.
+    fn leaf_bytes(&self, boxes: &[u32]) -> usize;
     /// Stack entries that a traversal of what stands below a leaf needs.
     fn stack_below(&self, boxes: &[u32]) -> usize;
     /// Writes the record of a leaf with these boxes, and returns the reference to it; `at` is the offset of `out`.
@@ -79,7 +79,7 @@ impl<'a, C: Content> Plan<'a, C> {
                 inner.push(child);
             } else {
                 let boxes = self.boxes(child);
-                bytes += self.content.leaf_bytes(boxes.len());
+                bytes += self.content.leaf_bytes(boxes);
                 stack = stack.max(others + self.content.stack_below(boxes));
             }
         }
@@ -109,7 +109,7 @@ impl<'a, C: Content> Plan<'a, C> {
         for (slot, &child) in children.iter().enumerate() {
             if !self.is_inner(child) {
                 let boxes = self.boxes(child);
-                let bytes = self.content.leaf_bytes(boxes.len());
+                let bytes = self.content.leaf_bytes(boxes);
                 let reference = self.content.write_leaf(boxes, &mut out[used..used + bytes], at + used);
                 write_slot(out, 0, slot, &self.node(child).aabb, reference);
                 used += bytes;

@@ -12,6 +12,7 @@ pub mod forest;
 mod ids;
 mod layout;
 mod order;
+mod parts;
 mod regions;
 mod sah;
 mod top;

@@ -35,7 +35,7 @@ const FORK_ABOVE: usize = 1 << 14;
 const MAX_SAH_DEPTH: usize = 64;
 
 /// Builds the tree. Needs 1 to 2^31 boxes, not inverted, with finite coordinates whose areas are finite.
-pub(super) fn build(boxes: impl ExactSizeIterator<Item = Aabb>, fork: &dyn Fork) -> BinaryTree {
+pub(super) fn build(boxes: impl Iterator<Item = Aabb>, fork: &dyn Fork) -> BinaryTree {
     let mut items: Vec<Item> = boxes.enumerate().map(|(i, b)| Item::new(&b, i as u32)).collect();
     assert!(!items.is_empty() && items.len() <= 1 << 31, "1 to 2^31 boxes");
     let blank = BinaryNode { aabb: Aabb::EMPTY, child: 0, count: 0 };

@@ -92,7 +92,7 @@ impl Content for Top {
     fn max_leaf(&self) -> u32 {
         1
     }
-    fn leaf_bytes(&self, _: usize) -> usize {
+    fn leaf_bytes(&self, _: &[u32]) -> usize {
         0
     }
     fn stack_below(&self, boxes: &[u32]) -> usize {

@@ -44,7 +44,7 @@ fn each_kind_of_damage_is_named() {
     says(with(&|o| o.truncate(100)), "shorter than its header");
     says(with(&|o| o.clear()), "shorter than its header");
     says(with(&|o| o[0] = 0), "does not begin as one");
-    says(with(&|o| write_u32(o, 8, 2)), "version 2");
+    says(with(&|o| write_u32(o, 8, 3)), "version 3");
     says(with(&|o| o.push(0)), "its length");
     says(with(&|o| write_u32(o, 12, u32::MAX)), "more primitives");
     says(with(&|o| write_u32(o, 12, 151)), "primitives are missing");
@@ -79,11 +79,13 @@ fn each_kind_of_damage_is_named() {
     let index = at + INDEX_ROW * n * 4;
     says(with(&|o| write_u32(o, index, 150)), "out of range or order");
     says(with(&|o| write_u32(o, index, read_u32(&good, index + 4))), "out of range or order");
-    says(with(&|o| write_f32(o, at, f32::NAN)), "does not contain its primitives");
-    says(with(&|o| write_f32(o, at, 5.0)), "does not contain its primitives");
+    says(with(&|o| write_f32(o, at, f32::NAN)), "a triangle passes the bounds");
+    says(with(&|o| write_f32(o, at, 5.0)), "a triangle passes the bounds");
+    let far = |o: &mut Vec<u8>| (0..3).for_each(|vertex| write_f32(o, at + 3 * vertex * n * 4, read_f32(&good, 52)));
+    says(with(&far), "a box does not meet its triangles");
     let other = read_u32(&good, index);
     let free = (0..150).find(|&i| i < other && i != other).unwrap();
-    says(with(&|o| write_u32(o, index, free)), "stands in two leaves");
+    says(with(&|o| write_u32(o, index, free)), "primitives are missing");
 }
 
 #[test]

@@ -91,3 +91,55 @@ fn closed_meshes_do_not_leak() {
         }
     }
 }
+
+/// A slanted room of twelve triangles around many small ones: its walls stand in many leaves, each with a box around a part. Rays at
+/// walls' vertices and edges, and within a wall at the planes between parts, must hit, and as without parts: as the plain search says.
+#[test]
+fn walls_in_parts_do_not_leak() {
+    let mut random = Random::new(31);
+    let slanted = |p: [f32; 3]| {
+        let [x, y, z] = p.map(f64::from);
+        // no side along an axis, no corner that is a round number
+        [0.8 * x - 0.36 * y + 0.48 * z + 0.1, 0.6 * x + 0.48 * y - 0.64 * z, 0.8 * y + 0.6 * z - 0.3].map(|x| x as f32)
+    };
+    let mut triangles: Vec<Triangle> = mesh(1, false).iter().map(|t| t.map(slanted)).collect();
+    let walls = triangles.len();
+    triangles.extend((0..4000).map(|_| {
+        let at = random.point(0.02);
+        [0; 3].map(|_| {
+            let p = random.point(0.004);
+            slanted(std::array::from_fn(|c| at[c] + p[c] + 0.7))
+        })
+    }));
+    let object = block(&triangles, &[]);
+    let without: usize = block(&triangles[walls..], &[]).len();
+    assert!(object.len() > without + 100 * 40, "the walls are not in parts: {} and {without} bytes", object.len());
+    let forest = forest(&[object]);
+    let middle = slanted([0.0; 3]);
+    let mut rays = Vec::new();
+    for k in 0..60_000 {
+        let t = triangles[random.below(walls)];
+        let (u, v) = (random.unit(), random.unit());
+        let (u, v) = match k % 3 {
+            0 => (0.0, v),
+            1 => (u, 0.0),
+            _ => (u * (1.0 - v), v),
+        };
+        let mut p: [f32; 3] = std::array::from_fn(|c| t[0][c] + (t[1][c] - t[0][c]) * u + (t[2][c] - t[0][c]) * v);
+        if k % 5 == 0 {
+            // a plane halfway down a wall's box, some times
+            let axis = random.below(3);
+            let (lo, hi) = t.iter().fold((f32::MAX, f32::MIN), |(lo, hi), q| (lo.min(q[axis]), hi.max(q[axis])));
+            p[axis] = lo + (hi - lo) * (random.below(16) as f32 / 16.0);
+        }
+        let d: [f32; 3] = std::array::from_fn(|c| p[c] - middle[c]);
+        rays.push(Ray { o: middle, tmin: 0.0, d, tmax: f32::INFINITY });
+    }
+    for mut tracer in kernels() {
+        let mut hits = vec![crate::ray::Hit::miss(0.0); rays.len()];
+        tracer.closest(&forest, &rays, &mut hits);
+        let lost = hits.iter().filter(|h| !h.is_hit()).count();
+        assert_eq!(lost, 0, "{:?}: {lost} of {} rays left the room", tracer.kernel(), rays.len());
+    }
+    super::check_all(&[forest], &triangles, &[], &rays[..600]);
+}
