@@ -43,7 +43,7 @@ impl Shapes {
         }
         // about two parts to a run; of four primitives at least
         let parts = (2 * count).clamp(1, MOST_PARTS);
-        let shift = (each.len() / parts).max(4).next_power_of_two().trailing_zeros();
+        let shift = each.len().div_ceil(parts).max(4).next_power_of_two().trailing_zeros();
         let part = |k: usize| starts.partition_point(|&start| start as usize <= k << shift) as u32;
         let guide = (0..=each.len().div_ceil(1 << shift)).map(part).collect();
         Shapes::Runs(Runs { starts, shapes, guide, shift })
