@@ -210,28 +210,21 @@ async fn an_api_server_that_fails_is_an_error_to_try_again() {
 
 #[tokio::test]
 async fn a_good_job_gets_its_finalizer_then_one_worker_that_prepares() {
-    let profile = json!({
-        "metadata": {"name": "rayherd-storage-default"},
-        "data": {"profile.yaml": "bucket: herd\nendpoints: [{url: 'http://127.0.0.1:1', node: node1}]"},
-    });
-    let secret = json!({"metadata": {"name": "rayherd-storage"}, "data": {"AWS_ACCESS_KEY_ID": "YQ==", "AWS_SECRET_ACCESS_KEY": "Yg=="}});
     let mut with_finalizer = job();
     with_finalizer["metadata"]["finalizers"] = json!([FINALIZER]);
     let pod = json!({"metadata": {"name": "box-w0", "uid": "p-0", "labels": {"rayherd.io/worker": "0"}}});
-    let steps = vec![
-        step("GET", PROFILE, 200, profile),
-        step("GET", SECRET, 200, secret),
-        step("PATCH", JOB, 200, with_finalizer.clone())
-            .with("/metadata/finalizers", json!([FINALIZER]))
-            .with("/metadata/resourceVersion", json!("7")),
-        step("GET", PODS, 200, no_pods()),
+    let mut steps = begins(no_pods());
+    steps[2] = step("PATCH", JOB, 200, with_finalizer.clone())
+        .with("/metadata/finalizers", json!([FINALIZER]))
+        .with("/metadata/resourceVersion", json!("7"));
+    steps.extend([
         step("PATCH", "/api/v1/namespaces/studio/pods/box-w0?", 201, pod.clone())
             .with("/metadata/ownerReferences/0/uid", json!("u-1"))
             .with("/spec/automountServiceAccountToken", json!(false)),
         step("PATCH", STATUS, 200, with_finalizer.clone())
             .with("/status/phase", json!("Pending"))
             .with("/status/workers", json!("0/2")),
-    ];
+    ]);
     let (done, said, context) = scenario(&job(), steps).await;
     assert_ne!(done.unwrap(), Action::await_change());
     assert!(said[5]["status"].get("ledger").is_none(), "the pointers belong to another manager");
