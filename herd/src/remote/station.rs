@@ -197,7 +197,9 @@ impl<'l> Station<'l> {
         let scene = loop {
             match self.open(stage) {
                 Ok(scene) => break scene,
-                Err(e) if matches!(Failure::from(&e), Failure::ForNow { .. }) && !self.is_leaving() => {
+                // whoever leaves needs it no more
+                Err(_) if self.is_leaving() => return Ok(Next::Over),
+                Err(e) if matches!(Failure::from(&e), Failure::ForNow { .. }) => {
                     tracing::warn!("{e}; trying again");
                     std::thread::sleep(PAUSE);
                 }

@@ -177,9 +177,7 @@ impl Cluster {
         cluster
     }
     fn depot(&self, home: Option<u32>) -> Depot {
-        let patience = Patience { answer: Duration::from_millis(200), pause: Duration::from_millis(300) };
-        let watched = |s: &Arc<Faulty>| Arc::new(Watched::new(s.clone(), s.clone(), patience));
-        Depot::watched(self.stores.iter().map(watched).collect(), home).unwrap()
+        depot(&self.stores, home)
     }
     fn job<'a>(&'a self, spec: &'a RenderJobSpec, depot: &'a Depot, fleet: &'a Fleet, session: &str) -> Job<'a> {
         Job {
@@ -251,6 +249,12 @@ impl Cluster {
             job.join().unwrap()
         })
     }
+}
+
+fn depot(stores: &[Arc<Faulty>], home: Option<u32>) -> Depot {
+    let patience = Patience { answer: Duration::from_millis(200), pause: Duration::from_millis(300) };
+    let watched = |s: &Arc<Faulty>| Arc::new(Watched::new(s.clone(), s.clone(), patience));
+    Depot::watched(stores.iter().map(watched).collect(), home).unwrap()
 }
 
 fn wait_for(what: impl Fn() -> bool) {

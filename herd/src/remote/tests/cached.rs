@@ -21,12 +21,21 @@ use crate::wave::CameraUnit;
 fn external() -> (S3Server, Cluster) {
     let cluster = Cluster::new(1);
     let server = cluster.runtime.block_on(S3Server::start());
-    let store = Arc::new(S3Store::new(server.settings("")).unwrap());
-    let stores = vec![Arc::new(Faulty::new(store, FaultPlan::default()))];
-    let cluster = Cluster { stores, ..cluster };
+    let cluster = Cluster { stores: client(&server), ..cluster };
     cluster.runtime.block_on(cluster.stores[0].put(SOURCE, CORNELL.clone().into())).unwrap();
     cluster.runtime.block_on(cluster.stores[0].put(TEXTURE, wall().into())).unwrap();
     (server, cluster)
+}
+
+fn client(server: &S3Server) -> Vec<Arc<Faulty>> {
+    let store = Arc::new(S3Store::new(server.settings("")).unwrap());
+    vec![Arc::new(Faulty::new(store, FaultPlan::default()))]
+}
+
+/// A worker with a client of its own, as in a pod: connections live on the threads of the worker that made them.
+fn worker<'l>(server: &S3Server, cluster: &Cluster, link: &'l Wire<'l>, number: u32) -> Station<'l> {
+    let id = WorkerId { number, session: "s".into() };
+    Station::new(link, depot(&client(server), None), 1, id, cluster.scratch.path().to_owned()).unwrap()
 }
 
 /// Scene bytes that a report counts at a place.
@@ -38,7 +47,7 @@ fn read(report: &report::Report, place: Place) -> u64 {
 
 /// Two pictures of one scene by two workers with a memory of one split; what each picture's report says, and the fleet's failures.
 fn two_pictures(
-    cluster: &Cluster,
+    (server, cluster): (&S3Server, &Cluster),
     spec: &RenderJobSpec,
     cache: &dyn Fn() -> Option<Copies>,
 ) -> (Vec<report::Report>, u64) {
@@ -46,7 +55,7 @@ fn two_pictures(
     let wire = cluster.wire(&fleet);
     std::thread::scope(|scope| {
         for number in 0..2 {
-            let mut station = cluster.station(&wire, number, "s", None);
+            let mut station = worker(server, cluster, &wire, number);
             if let Some(copies) = cache() {
                 station = station.caching(copies);
             }
@@ -85,7 +94,7 @@ fn a_cache_of_any_size_or_none_changes_no_byte_and_a_large_one_reads_all_once() 
             "full" => Some(Copies::new(Arc::new(MemoryStore::with_limit(3000)), 1 << 30)),
             _ => Some(Copies::in_folder(&not_a_folder, 1 << 30)),
         };
-        let (reports, failures) = two_pictures(&cluster, &spec, &cache);
+        let (reports, failures) = two_pictures((&server, &cluster), &spec, &cache);
         for name in ["out/a.exr", "out/b.exr"] {
             assert!(cluster.runtime.block_on(cluster.stores[0].get(name)).unwrap() == want, "{case}: {name}");
         }
@@ -142,7 +151,7 @@ fn what_a_worker_has_cached_makes_it_a_holder_and_is_read_from_s3_no_more() {
     std::thread::scope(|scope| {
         for number in 0..2u32 {
             let copies = Copies::in_folder(&folder.path().join(number.to_string()), 1 << 30);
-            let station = cluster.station(&wire, number, "s", None).caching(copies);
+            let station = worker(&server, &cluster, &wire, number).caching(copies);
             scope.spawn(move || station.run().unwrap());
         }
         let prepare = Work::Prepare { spec: Box::new(spec.clone()), replicas: 1 };
