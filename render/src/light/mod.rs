@@ -59,31 +59,40 @@ pub struct Lights {
     sky: Sky,
     sky_probability: f32,
     only_triangles: bool,
-    /// The sources once more, if they are even triangles and at most [`FEW`]: in the order of the tree's only node, if there is a tree.
-    few: Vec<FewTriangles>,
+    /// The sources once more, if they are primitives that shine evenly and at most [`FEW`]: in the order of the tree's only node, if there
+    /// is a tree.
+    few: Vec<FewLight>,
     pictures: Vec<Picture>,
 }
 
-/// All sources, where they are triangles and few.
+/// All sources, where they are primitives that shine evenly, and few.
 pub(crate) enum Few<'l> {
     /// Chosen by numbers that are the same everywhere.
-    ByPower(&'l [FewTriangles]),
+    ByPower(&'l [FewLight]),
     /// Each is a child of the node, in this order.
-    ByPlace(&'l Node, &'l [FewTriangles]),
+    ByPlace(&'l Node, &'l [FewLight]),
 }
 
 /// So many sources are chosen from by comparing with each.
 const FEW: usize = 8;
 
-/// A triangle of those that are all the sources there are.
+/// One of those that are all the sources there are.
 #[derive(Clone, Debug)]
-pub(crate) struct FewTriangles {
+pub(crate) struct FewLight {
     /// Where its interval begins, by power; the next one's begins where it ends.
     pub start: u32,
-    pub light: TriangleLight,
+    pub shape: FewShape,
     pub radiance: Vec3,
     /// With which it is chosen, by power.
     pub probability: f32,
+}
+
+/// What shines evenly.
+#[derive(Clone, Copy, Debug)]
+pub(crate) enum FewShape {
+    Triangle(TriangleLight),
+    /// To the outside.
+    Sphere(SphereLight),
 }
 
 /// One primitive, or the sky.
@@ -234,7 +243,7 @@ impl Lights {
         let (mut tree, mut in_tree) = (None, 0);
         let mut ends = Vec::new();
         let only_triangles = !sources.is_empty() && sources.iter().all(Source::is_even_triangle);
-        let is_few = only_triangles && sources.len() <= FEW;
+        let is_few = sources.len() <= FEW && sources.iter().all(|s| s.even().is_some());
         if wants_tree(bounds.len(), parts) {
             in_tree = bounds.len();
             // the tree as one weight, before those that are not in it
@@ -253,7 +262,7 @@ impl Lights {
         let sky_probability = sky.mean().map_or(0.0, |_| sources.last().map_or(0.0, |s| s.probability));
         let few = match &tree {
             _ if !is_few => Vec::new(),
-            None => few_triangles(&sources, &ends),
+            None => few_by_power(&sources, &ends),
             Some(tree) => children(&sources, tree.root()),
         };
         Lights { sources, tree, ends, in_tree, by_prim, sky, sky_probability, only_triangles, few, pictures }
@@ -385,9 +394,9 @@ impl Lights {
         self.only_triangles
     }
 
-    /// All sources, if they are even triangles and few.
+    /// All sources, if they are primitives that shine evenly, and few.
     #[inline(always)]
-    pub(crate) fn few_triangles(&self) -> Option<Few<'_>> {
+    pub(crate) fn few(&self) -> Option<Few<'_>> {
         match &self.tree {
             _ if self.few.is_empty() => None,
             None => Some(Few::ByPower(&self.few)),
@@ -439,7 +448,16 @@ impl Lights {
 
 impl Source {
     fn is_even_triangle(&self) -> bool {
-        matches!(self.geometry, Geometry::Triangle(_)) && self.picture.is_none()
+        matches!(self.even(), Some(FewShape::Triangle(_)))
+    }
+    /// Of a primitive that shines evenly, a sphere only if it does to the outside.
+    fn even(&self) -> Option<FewShape> {
+        match self.geometry {
+            _ if self.picture.is_some() => None,
+            Geometry::Triangle(light) => Some(FewShape::Triangle(light)),
+            Geometry::Sphere(light) if !light.is_flipped() => Some(FewShape::Sphere(light)),
+            _ => None,
+        }
     }
 }
 
@@ -459,27 +477,21 @@ pub(crate) fn probability(numbers: u64) -> f32 {
     (numbers as f64 / 4_294_967_296.0) as f32
 }
 
-/// Sources that are triangles, with the beginnings of their intervals; without those that begin, and end, at 2^32.
-fn few_triangles(sources: &[Source], ends: &[u64]) -> Vec<FewTriangles> {
+/// Sources with the beginnings of their intervals; without those that begin, and end, at 2^32.
+fn few_by_power(sources: &[Source], ends: &[u64]) -> Vec<FewLight> {
     let starts = std::iter::once(0).chain(ends.iter().copied());
-    let few = sources.iter().zip(starts).filter_map(|(source, start)| match source.geometry {
-        Geometry::Triangle(light) => Some(FewTriangles {
-            start: u32::try_from(start).ok()?,
-            light,
-            radiance: source.emission,
-            probability: source.probability,
-        }),
-        _ => None,
+    let few = sources.iter().zip(starts).filter_map(|(source, start)| {
+        let (start, shape) = (u32::try_from(start).ok()?, source.even()?);
+        Some(FewLight { start, shape, radiance: source.emission, probability: source.probability })
     });
     few.collect()
 }
 
-/// Sources that are triangles, as the children of a node are; nothing if one is not.
-fn children(sources: &[Source], node: &Node) -> Vec<FewTriangles> {
+/// Sources as the children of a node are; nothing if a child is none.
+fn children(sources: &[Source], node: &Node) -> Vec<FewLight> {
     let few = (0..node.children()).map(|k| {
         let source = &sources[node.source(k)? as usize];
-        let Geometry::Triangle(light) = source.geometry else { return None };
-        Some(FewTriangles { start: 0, light, radiance: source.emission, probability: 0.0 })
+        Some(FewLight { start: 0, shape: source.even()?, radiance: source.emission, probability: 0.0 })
     });
     few.collect::<Option<_>>().unwrap_or_default()
 }

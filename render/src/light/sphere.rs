@@ -43,6 +43,11 @@ impl SphereLight {
         self.radius
     }
 
+    /// Whether it emits to the inside.
+    pub(super) fn is_flipped(&self) -> bool {
+        self.flipped
+    }
+
     /// Area.
     pub fn area(&self) -> f32 {
         4.0 * PI * self.radius * self.radius

@@ -173,7 +173,7 @@ fn the_mean_is_that_by_power_and_the_variance_less() {
     assert!(beyond <= 2 && gain.exp() > 1.8, "{beyond} {}", gain.exp());
 }
 
-/// One lamp of at most eight primitives is chosen from by power; more make a tree, whose only node serves few triangles.
+/// One lamp of at most eight primitives is chosen from by power; more make a tree, whose only node serves a few.
 #[test]
 fn one_lamp_needs_no_tree() {
     let quad = [
@@ -181,23 +181,26 @@ fn one_lamp_needs_no_tree() {
         (Primitive::Triangle([[1.0, 1.0, 0.0], [1.0, 1.0, 1.0], [0.0, 1.0, 1.0]]), 0),
     ];
     let one = Lights::new(&world(&quad, &[1.0], None));
-    assert!(one.tree.is_none() && matches!(one.few_triangles(), Some(Few::ByPower(few)) if few.len() == 2));
+    assert!(one.tree.is_none() && matches!(one.few(), Some(Few::ByPower(few)) if few.len() == 2));
     let ball = (Primitive::Sphere { center: [0.0; 3], radius: 1.0, flipped: false }, 0);
     assert!(Lights::new(&world(&[ball], &[1.0], Some([1.0; 3]))).tree.is_none());
     let two = Lights::new(&world(&[quad[0], quad[1], (ball.0, 1)], &[1.0, 1.0], None));
-    assert!(two.tree.is_some() && two.few_triangles().is_none());
+    let Some(Few::ByPlace(_, few)) = two.few() else { panic!("not few") };
+    assert_eq!(few.iter().filter(|l| matches!(l.shape, FewShape::Sphere(_))).count(), 1);
+    let inward = (Primitive::Sphere { center: [0.0; 3], radius: 1.0, flipped: true }, 1);
+    assert!(Lights::new(&world(&[quad[0], inward], &[1.0, 1.0], None)).few().is_none());
     let pair = |n: u32| [(quad[0].0, n), (quad[1].0, n)];
     let four: Vec<_> = (0..4).flat_map(pair).collect();
     let lights = Lights::new(&world(&four, &[1.0, 2.0, 3.0, 4.0], None));
-    let Some(Few::ByPlace(node, few)) = lights.few_triangles() else { panic!("not few") };
+    let Some(Few::ByPlace(node, few)) = lights.few() else { panic!("not few") };
     assert_eq!((node.children(), few.len()), (8, 8));
     for (k, light) in few.iter().enumerate() {
         let source = &lights.sources[node.source(k).unwrap() as usize];
         let Geometry::Triangle(t) = source.geometry else { panic!("no triangle") };
-        assert!(t.p0 == light.light.p0 && source.emission == light.radiance);
+        assert!(matches!(light.shape, FewShape::Triangle(l) if l.p0 == t.p0) && source.emission == light.radiance);
     }
     let five = Lights::new(&world(&[four, pair(4).to_vec()].concat(), &[1.0; 5], None));
-    assert!(five.tree.is_some() && five.few_triangles().is_none());
+    assert!(five.tree.is_some() && five.few().is_none());
 }
 
 /// Lights in one place, on a line, of powers from 1e-30 to 1e30, and points that are none: every choice is a source with a probability.

@@ -4,6 +4,8 @@ mod scalar;
 mod setup;
 mod sphere;
 #[cfg(all(target_arch = "x86_64", not(feature = "double")))]
+mod spheres;
+#[cfg(all(target_arch = "x86_64", not(feature = "double")))]
 mod start;
 mod triangle;
 #[cfg(all(target_arch = "x86_64", not(feature = "double")))]
@@ -135,8 +137,8 @@ impl Tracer {
     fn run_part<const ANY: bool>(&mut self, forest: &Forest, rays: &[Ray], done: &mut impl FnMut(usize, &State)) {
         let Tracer { kernel, counters, stack, sorter, .. } = self;
         // triangles first, then the spheres that are nearer
-        let spheres = forest.sphere_root();
-        let asks = |state: &State| spheres.filter(|_| !(ANY && state.prim != MISS));
+        let sphere_root = forest.sphere_root();
+        let asks = |state: &State| sphere_root.filter(|_| !(ANY && state.prim != MISS));
         let order = match (sorter, forest.bounds()) {
             (Some(sorter), Some(bounds)) => sorter.order(bounds, rays),
             _ => &[],
@@ -147,7 +149,7 @@ impl Tracer {
                 let (kernel, mut of_spheres) = (*kernel, Counters::default());
                 let mut finish = |i: usize, state: &mut State| {
                     if let Some(root) = asks(state) {
-                        wide::spheres::<ANY>(kernel, forest, root, &rays[i], state, stack, &mut of_spheres);
+                        spheres::trace::<ANY>(kernel, forest, root, &rays[i], state, stack, &mut of_spheres);
                     }
                     done(i, state);
                 };
@@ -161,8 +163,7 @@ impl Tracer {
                     let mut state = State::new(&rays[i], real(forest.largest()));
                     scalar::triangles(forest, &mut state, ANY, stack, counters);
                     if let Some(root) = asks(&state) {
-                        let enter = scalar::enter_children;
-                        scalar::spheres(forest, root, &rays[i], &mut state, ANY, stack, counters, enter);
+                        scalar::spheres(forest, root, &rays[i], &mut state, ANY, stack, counters);
                     }
                     done(i, &state);
                 }

@@ -26,8 +26,7 @@ pub(super) fn triangles(forest: &Forest, state: &mut State, any: bool, stack: &m
     });
 }
 
-/// Traces one ray through the forest's spheres; `state` has the best hit so far. `enter` is the box test, as [`enter_children`].
-#[inline(always)]
+/// Traces one ray through the forest's spheres; `state` has the best hit so far.
 pub(super) fn spheres(
     forest: &Forest,
     root: u32,
@@ -36,10 +35,9 @@ pub(super) fn spheres(
     any: bool,
     stack: &mut Stack,
     counters: &mut Counters,
-    enter: impl Fn(&State, &[u8], usize, &mut Stack),
 ) {
     let arena = forest.arena();
-    traverse(arena, root, state, stack, counters, enter, |state, leaf| {
+    traverse(arena, root, state, stack, counters, enter_children, |state, leaf| {
         let (at, n) = (offset(leaf), leaf_len(leaf));
         for i in 0..n {
             let s = read_sphere(arena, at, n, i);
@@ -53,7 +51,7 @@ pub(super) fn spheres(
 
 /// Visits the leaves whose boxes the ray enters, about nearest first, until `leaf` says that it is enough.
 #[inline(always)]
-fn traverse(
+pub(super) fn traverse(
     arena: &[u8],
     root: u32,
     state: &mut State,
@@ -86,7 +84,7 @@ fn traverse(
 }
 
 /// Pushes those of a node's children that the ray enters, slot by slot.
-pub(super) fn enter_children(state: &State, arena: &[u8], node: usize, stack: &mut Stack) {
+fn enter_children(state: &State, arena: &[u8], node: usize, stack: &mut Stack) {
     for slot in 0..WIDTH {
         let (aabb, child) = read_slot(arena, node, slot);
         if let Some(entry) = enter(state, &aabb) {

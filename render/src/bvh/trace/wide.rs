@@ -22,7 +22,7 @@ use super::setup::State;
 use super::start::start;
 use super::triangle::{SMALL_AREA, barycentrics_of_small};
 use super::vector::{Avx2, Avx512, InstructionSet, sort4, sort8};
-use super::{Counters, Kernel, accept, runs, scalar};
+use super::{Counters, Kernel, accept, runs};
 use crate::ray::Ray;
 
 /// Rays in flight; 32 are 1 to 14 % slower where the tree is larger than the caches, 64 are no faster (docs/benchmarks/tried.md).
@@ -325,92 +325,12 @@ unsafe fn rounds<I: InstructionSet, const ANY: bool, D: FnMut(usize, &mut State)
     }
 }
 
-/// Traces one ray through the forest's spheres: [`scalar::spheres`], eight boxes at a time.
-///
-/// # Panics
-/// As [`trace`].
-pub(super) fn spheres<const ANY: bool>(
-    kernel: Kernel,
-    forest: &Forest,
-    root: u32,
-    ray: &Ray,
-    state: &mut State,
-    stack: &mut scalar::Stack,
-    counters: &mut Counters,
-) {
-    match kernel {
-        // SAFETY: `trace` found that the processor has the features.
-        Kernel::Avx512 => unsafe { spheres_avx512::<ANY>(forest, root, ray, state, stack, counters) },
-        // SAFETY: as above.
-        Kernel::Avx2 => unsafe { spheres_avx2::<ANY>(forest, root, ray, state, stack, counters) },
-        Kernel::Auto | Kernel::Scalar => unreachable!("no vector kernel"),
-    }
-}
-
-/// [`spheres`] with AVX-512.
-///
-/// # Safety
-/// The processor has what is enabled here.
-#[target_feature(enable = "avx2,fma,bmi1,bmi2,popcnt,lzcnt,avx512f,avx512vl,avx512dq,avx512bw")]
-unsafe fn spheres_avx512<const ANY: bool>(
-    forest: &Forest,
-    root: u32,
-    ray: &Ray,
-    state: &mut State,
-    stack: &mut scalar::Stack,
-    counters: &mut Counters,
-) {
-    // SAFETY: the features are enabled.
-    let enter = |s: &State, arena: &[u8], node, stack: &mut _| unsafe { enter::<Avx512>(s, arena, node, stack) };
-    scalar::spheres(forest, root, ray, state, ANY, stack, counters, enter);
-}
-
-/// [`spheres`] with AVX2.
-///
-/// # Safety
-/// The processor has what is enabled here.
-#[target_feature(enable = "avx2,fma,bmi1,bmi2,popcnt,lzcnt")]
-unsafe fn spheres_avx2<const ANY: bool>(
-    forest: &Forest,
-    root: u32,
-    ray: &Ray,
-    state: &mut State,
-    stack: &mut scalar::Stack,
-    counters: &mut Counters,
-) {
-    // SAFETY: the features are enabled.
-    let enter = |s: &State, arena: &[u8], node, stack: &mut _| unsafe { enter::<Avx2>(s, arena, node, stack) };
-    scalar::spheres(forest, root, ray, state, ANY, stack, counters, enter);
-}
-
-/// [`scalar::enter_children`].
-///
-/// # Safety
-/// Features of `I` are enabled.
-#[inline(always)]
-unsafe fn enter<I: InstructionSet>(state: &State, arena: &[u8], node: usize, stack: &mut scalar::Stack) {
-    let node: &[u8; NODE_BYTES] = arena[node..].first_chunk().expect("a whole node");
-    let (mut distances, mut references) = ([0.0f32; WIDTH], [0u32; WIDTH]);
-    // SAFETY: a node, aligned as all of the arena's are; arrays of a vector's size.
-    let mut mask = unsafe {
-        let (mask, distance, children) = boxes::<I>(node.as_ptr(), state);
-        _mm256_storeu_ps(distances.as_mut_ptr(), distance);
-        _mm256_storeu_si256(references.as_mut_ptr().cast(), children);
-        mask
-    };
-    while mask != 0 {
-        let slot = mask.trailing_zeros() as usize;
-        mask &= mask - 1;
-        stack.push((distances[slot], references[slot]));
-    }
-}
-
 /// Tests a node's eight boxes: mask of those entered, entry distances, references. Conservative: see [`super::setup`].
 ///
 /// # Safety
 /// `node` is a node; features of `I` are enabled.
 #[inline(always)]
-unsafe fn boxes<I: InstructionSet>(node: *const u8, state: &State) -> (u32, __m256, __m256i) {
+pub(super) unsafe fn boxes<I: InstructionSet>(node: *const u8, state: &State) -> (u32, __m256, __m256i) {
     // SAFETY: rows are 32 bytes each within the node's 224, and nodes are aligned to 64.
     unsafe {
         let all = |x: f32| _mm256_set1_ps(x);

@@ -1,14 +1,14 @@
 //! Choosing lights and points on them.
 
 use super::{Block, N, set, set3};
-use crate::light::{Few, FewTriangles, LightSample, Node, SphereLight, TriangleLight, end, probability};
+use crate::light::{Few, FewLight, FewShape, LightSample, Node, SphereLight, TriangleLight, end, probability};
 use crate::path::Context;
 use crate::path::vertex::select;
 
 impl Block {
     #[inline(always)]
     pub(super) fn choose_lights(&mut self, context: &Context) {
-        match context.lights.few_triangles() {
+        match context.lights.few() {
             Some(Few::ByPower(few)) => return self.choose_by_power(few),
             Some(Few::ByPlace(node, few)) => return self.choose_by_place(node, few),
             None => {}
@@ -44,7 +44,8 @@ impl Block {
 
     /// By comparing each number with each source: the last whose interval begins at or before it.
     #[inline(always)]
-    fn choose_by_power(&mut self, few: &[FewTriangles]) {
+    fn choose_by_power(&mut self, few: &[FewLight]) {
+        self.is_ball = [false; N];
         for light in few {
             // bits all 1 where it is chosen: a select of floats would be unrolled into branches
             let mut mask = [0; N];
@@ -58,8 +59,9 @@ impl Block {
 
     /// As [`crate::light::Lights::choose`] does in the tree's only node: by the interval in which each number lies.
     #[inline(always)]
-    fn choose_by_place(&mut self, node: &Node, few: &[FewTriangles]) {
+    fn choose_by_place(&mut self, node: &Node, few: &[FewLight]) {
         const MOST: usize = 8;
+        self.is_ball = [false; N];
         let few = &few[..few.len().min(MOST)];
         let (mut sums, mut counts) = ([[0.0; N]; MOST], [[0; N]; MOST]);
         let (mut all, mut count) = ([0.0; N], [0; N]);
@@ -99,15 +101,27 @@ impl Block {
 
     /// Takes a light where the mask's bits are 1.
     #[inline(always)]
-    fn take(&mut self, FewTriangles { light, radiance, .. }: &FewTriangles, mask: &[u32; N]) {
+    fn take(&mut self, FewLight { shape, radiance, .. }: &FewLight, mask: &[u32; N]) {
         // written out: of loops over vectors and their components the compiler makes gathers and scatters across these
-        set3(&mut self.light_p0, light.p0, mask);
-        set3(&mut self.light_e1, light.e1, mask);
-        set3(&mut self.light_e2, light.e2, mask);
-        set3(&mut self.light_normal, light.normal, mask);
         set3(&mut self.radiance, *radiance, mask);
-        set(&mut self.light_area, light.area, mask);
-        set(&mut self.light_error, light.error, mask);
+        let is_sphere = matches!(shape, FewShape::Sphere(_));
+        for i in 0..N {
+            self.is_ball[i] = if mask[i] != 0 { is_sphere } else { self.is_ball[i] };
+        }
+        match shape {
+            FewShape::Triangle(light) => {
+                set3(&mut self.light_p0, light.p0, mask);
+                set3(&mut self.light_e1, light.e1, mask);
+                set3(&mut self.light_e2, light.e2, mask);
+                set3(&mut self.light_normal, light.normal, mask);
+                set(&mut self.light_area, light.area, mask);
+                set(&mut self.light_error, light.error, mask);
+            }
+            FewShape::Sphere(light) => {
+                set3(&mut self.light_center, light.center(), mask);
+                set(&mut self.light_radius, light.radius(), mask);
+            }
+        }
     }
 
     #[inline(always)]
@@ -129,7 +143,7 @@ impl Block {
         }
     }
 
-    /// Spheres that are seen from outside, where there is one.
+    /// Spheres, where there is one.
     #[inline(always)]
     fn sample_balls(&mut self) {
         if !self.is_ball[..self.len].contains(&true) {
@@ -137,22 +151,24 @@ impl Block {
         }
         for i in 0..N {
             let sphere = SphereLight::new(self.light_center.get(i).to_array(), self.light_radius[i], false);
-            let (d, tmax, pdf) = sphere.sample_outside(self.origin.get(i), [self.place[0][i], self.place[1][i]]);
+            let o = self.origin.get(i);
+            let (d, tmax, pdf) = sphere.sample_outside(o, [self.place[0][i], self.place[1][i]]);
             let yes = self.is_ball[i];
+            let lit = sphere.is_lit_outside(o) & (self.probability[i] > 0.0);
             self.light_d.set(i, select(yes, d, self.light_d.get(i)));
             self.light_tmax[i] = if yes { tmax } else { self.light_tmax[i] };
             self.light_pdf[i] = if yes { pdf * self.probability[i] } else { self.light_pdf[i] };
-            self.lit[i] |= yes;
+            self.lit[i] = if yes { lit } else { self.lit[i] };
         }
     }
 
     /// Sources that are neither, one by one; and where nothing was chosen there is no light.
     #[inline(always)]
     pub(super) fn other_lights(&mut self, context: &Context) {
-        if context.lights.few_triangles().is_some() {
+        self.sample_balls();
+        if context.lights.few().is_some() {
             return;
         }
-        self.sample_balls();
         let far_sky = context.lights.has_far_sky();
         let (mut skies, mut lanes, mut count) = ([[0; 2]; N], [0u8; N], 0);
         let mut probability = 0.0;

@@ -201,10 +201,28 @@ fn lamps(more: u32) -> Scene {
     scene
 }
 
+/// The Cornell box with spheres as lamps, a large one about the camera and the ends of the walls, and with its own lamp or without.
+fn balls(count: usize, with_lamp: bool) -> Scene {
+    let mut scene = cornell::scene();
+    for shape in scene.shapes.iter_mut().filter(|_| !with_lamp) {
+        shape.emission = None;
+    }
+    let white = scene.diffuse(0.8);
+    let places = [([0.0, 0.0, 3.0], 2.6), ([-0.5, 0.3, 0.2], 0.2), ([0.1, 0.6, -0.4], 0.1), ([0.7, 0.7, 0.7], 0.05)];
+    for (k, &(center, radius)) in places.iter().take(count).enumerate() {
+        let lamp = scene.shape(white, Some([1.0 + k as f32, 2.0, 0.5]));
+        scene.sphere(lamp, center, radius, false);
+    }
+    scene
+}
+
 /// Every ray alone, and the plain way, gives what the batch gives; also in another order.
 #[test]
 fn batches_do_not_matter() {
-    for (scene, split) in [(cornell::scene(), 1), (lamps(3), 2), (lamps(9), 1), (motley(), 3), (glossy(), 2)] {
+    let balls = [(balls(1, false), 1), (balls(3, false), 2), (balls(4, true), 1)];
+    let others = [(cornell::scene(), 1), (lamps(3), 2), (lamps(9), 1), (motley(), 3), (glossy(), 2)];
+    assert!(balls.iter().all(|(scene, _)| scene.lights().few().is_some()));
+    for (scene, split) in balls.into_iter().chain(others) {
         for skips in [Skips::ALL, Skips::NONE] {
             check_batches(&scene, split, skips);
         }
