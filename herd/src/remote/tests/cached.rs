@@ -113,6 +113,15 @@ fn a_cache_of_any_size_or_none_changes_no_byte_and_a_large_one_reads_all_once() 
     assert!(2 * reads["large"] < reads["none"], "{reads:?}");
 }
 
+/// Ends a fleet, so that its workers go, also where a test fails.
+struct Ending<'a>(&'a Fleet);
+
+impl Drop for Ending<'_> {
+    fn drop(&mut self) {
+        self.0.end();
+    }
+}
+
 /// A fleet whose workers have a stage open, driven by hand.
 struct Driven<'a> {
     fleet: &'a Fleet,
@@ -149,6 +158,7 @@ fn what_a_worker_has_cached_makes_it_a_holder_and_is_read_from_s3_no_more() {
     let (fleet, depot) = (Fleet::new(2, "e"), cluster.depot(None));
     let wire = cluster.wire(&fleet);
     std::thread::scope(|scope| {
+        let _ending = Ending(&fleet);
         for number in 0..2u32 {
             let copies = Copies::in_folder(&folder.path().join(number.to_string()), 1 << 30);
             let station = worker(&server, &cluster, &wire, number).caching(copies);
@@ -175,6 +185,8 @@ fn what_a_worker_has_cached_makes_it_a_holder_and_is_read_from_s3_no_more() {
             band: BAND,
         };
         let holders = || -> Vec<Vec<u32>> { fleet.holders().unwrap().into_iter().take(4).collect() };
+        // a worker tells what it holds when it asks for more, which is after its result
+        let will_hold = |want: [&[u32]; 4]| wait_for(|| holders() == want);
         let begin = |id: &str, near: bool| {
             fleet.open(stage(id, near), placement(&scene, 1, 1), 0);
             wait_for(|| (0..2).all(|n| fleet.is_up(n)));
@@ -183,7 +195,7 @@ fn what_a_worker_has_cached_makes_it_a_holder_and_is_read_from_s3_no_more() {
         assert_eq!(holders(), [[0; 0]; 4], "the server is on no node");
         let (mut driven, own) = (Driven { fleet: &fleet, next: 0 }, [(0, 0), (0, 1), (1, 2), (1, 3)]);
         driven.round(&own);
-        assert_eq!(holders(), [[0], [0], [1], [1]]);
+        will_hold([&[0], &[0], &[1], &[1]]);
         let once = server.reads("objects/");
         let fetched = |bytes: &report::Bytes, at: Place| {
             bytes.sum(|_, o, k, p| o == Op::Read && p == at && matches!(k, Kind::Geometry | Kind::Attributes))
@@ -197,22 +209,22 @@ fn what_a_worker_has_cached_makes_it_a_holder_and_is_read_from_s3_no_more() {
         assert_eq!(fetched(&second, Place::Local), fetched(&first, Place::Remote), "memory had dropped all of it");
         // another one that reads a split holds it too
         driven.round(&[(1, 0)]);
-        assert_eq!(holders(), [vec![0, 1], vec![0], vec![1], vec![1]]);
+        will_hold([&[0, 1], &[0], &[1], &[1]]);
         assert!(server.reads("objects/") != once);
         // the next frame of the scene: what they hold is known when they have opened it, and neither the scene nor a split is read again
         let before = server.reads("objects/");
         begin("second", true);
-        assert_eq!(holders(), [vec![0, 1], vec![0], vec![1], vec![1]]);
+        will_hold([&[0, 1], &[0], &[1], &[1]]);
         driven.round(&own);
         assert_eq!(server.reads("objects/"), before);
         // where nobody is to look
         begin("third", false);
         assert_eq!(holders(), [[0; 0]; 4]);
         begin("fourth", true);
+        will_hold([&[0, 1], &[0], &[1], &[1]]);
         // a worker that is gone holds nothing
         fleet.gone(&WorkerId { number: 1, session: "s".into() });
         assert_eq!(holders()[..3], [vec![0], vec![0], vec![]]);
-        fleet.end();
     });
 }
 
