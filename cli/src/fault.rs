@@ -36,6 +36,7 @@ fn is_users(cause: &(dyn std::error::Error + 'static)) -> bool {
             PrepareError::Store(e) => object_is_users(e),
             PrepareError::Settings(_)
             | PrepareError::Empty { .. }
+            | PrepareError::Dark { .. }
             | PrepareError::Build { .. }
             | PrepareError::TooManySplits(_) => true,
             PrepareError::Inconsistent(_) | PrepareError::Spool { .. } => false,

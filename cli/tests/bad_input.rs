@@ -217,6 +217,31 @@ fn bombs() {
         )
         .write("deep-shapes.xml", "<scene version='3.0.0'>\n".to_owned() + &"<shape type='cube'>\n".repeat(1_000_000))
         .xml("nested.xml", &("<bsdf type='twosided'>\n".repeat(1000) + &"</bsdf>".repeat(1000)))
+        // from what is referred to and from what refers, and each more than once: 2^40 materials, 3^25 empty groups
+        .xml("chain.xml", &{
+            let links: String = (0..100_000)
+                .map(|i| format!("<bsdf type='twosided' id='m{i}'><ref id='m{}'/></bsdf>\n", i + 1))
+                .collect();
+            format!("<bsdf type='diffuse' id='m100000'/>\n{links}<shape type='cube'><ref id='m0'/></shape>{LIT}")
+        })
+        .xml("groups.xml", &{
+            let group = |i: usize, inside: &str| format!("<shape type='shapegroup' id='g{i}'>{inside}</shape>\n");
+            let instance = |i: usize| format!("<shape type='instance'><ref id='g{i}'/></shape>");
+            let links: String = (1..100_000).map(|i| group(i, &instance(i - 1))).collect();
+            format!("{}{links}{}{LIT}", group(0, "<shape type='cube'/>"), instance(99_999))
+        })
+        .xml("blends.xml", &{
+            let pair = |i: usize| format!("<ref id='m{0}'/><ref id='m{0}'/><float name='weight' value='0.5'/>", i - 1);
+            let links: String =
+                (1..=40).map(|i| format!("<bsdf type='blendbsdf' id='m{i}'>{}</bsdf>\n", pair(i))).collect();
+            format!("<bsdf type='diffuse' id='m0'/>\n{links}<shape type='cube'><ref id='m40'/></shape>{LIT}")
+        })
+        .xml("empty.xml", &{
+            let group = |i: usize, inside: &str| format!("<shape type='shapegroup' id='g{i}'>{inside}</shape>\n");
+            let instance = |i: usize| format!("<shape type='instance'><ref id='g{i}'/></shape>");
+            let links: String = (1..=25).map(|i| group(i, &instance(i - 1).repeat(3))).collect();
+            format!("{}{links}{}{LIT}", group(0, ""), instance(25))
+        })
         .write(
             "wide.xml",
             format!(
@@ -242,6 +267,10 @@ fn bombs() {
         ("render deep.xml", &["deep.xml:1", "element <a>"]),
         ("render deep-shapes.xml", &["deep-shapes.xml"]),
         ("render nested.xml", &["nested.xml:6", "nested deeper than 64"]),
+        ("render chain.xml", &["chain.xml:", "references nested deeper than 64"]),
+        ("render groups.xml", &["groups.xml:", "references nested deeper than 64"]),
+        ("render blends.xml", &["blends.xml", "262144 materials"]),
+        ("render empty.xml", &["empty.xml", "4194304 objects"]),
         ("render wide.xml", &["wide.xml", "10000 attributes"]),
         ("render line.obj.gz", &["line.obj.gz:5", "longer than"]),
         ("render word.stl.gz", &["word.stl.gz"]),
@@ -324,6 +353,10 @@ fn nothing_to_see_or_to_see_by() {
             "nan.xml",
             &format!("<shape type='cube'>\n<transform name='to_world'><scale value='nan'/></transform></shape>{LIT}"),
         )
+        .xml("line-light.xml", {
+            "<shape type='cube'/><shape type='rectangle' id='lamp'>\n<transform name='to_world'><scale x='0'/></transform>\
+             <emitter type='area'/></shape>"
+        })
         .xml("point.xml", &format!("<shape type='sphere'>\n<float name='radius' value='0'/></shape>{LIT}"))
         .write("even.nrrd", "NRRD0004\ntype: uchar\ndimension: 3\nsizes: 2 2 2\nencoding: raw\n\n\0\0\0\0\0\0\0\0");
     bed.mistakes(&[
@@ -338,6 +371,7 @@ fn nothing_to_see_or_to_see_by() {
         ("render flat.xml", &["flat.xml"]),
         ("render nan.xml", &["nan.xml:3"]),
         ("render point.xml", &["point.xml:2", "radius 0"]),
+        ("render line-light.xml", &["line-light.xml:2", "\"lamp\" emits, but has no area", "--light or --sky"]),
         ("render even.nrrd --iso 5", &["even.nrrd", "both sides of the iso value"]),
         ("render even.nrrd --iso nan", &["iso"]),
     ]);
@@ -396,6 +430,18 @@ fn what_lies_outside_or_is_no_file() {
         .xml("in/piped.xml", "\n<include filename='pipe.xml'/>")
         .pipe("in/pipe.obj")
         .xml("in/piped-mesh.xml", &mesh("pipe.obj"))
+        .pipe("in/pipe.png")
+        .xml(
+            "in/piped-texture.xml",
+            &format!(
+                "<shape type='cube'><bsdf type='diffuse'><texture type='bitmap' name='reflectance'>\n\
+                 <string name='filename' value='pipe.png'/></texture></bsdf></shape>{LIT}"
+            ),
+        )
+        .xml(
+            "in/piped-sky.xml",
+            "<shape type='cube'/><emitter type='envmap'>\n<string name='filename' value='pipe.png'/></emitter>",
+        )
         .write("in/up.nhdr", nhdr("../secret.raw"))
         .pipe("in/pipe.raw")
         .write("in/pipe.nhdr", nhdr("pipe.raw"));
@@ -448,6 +494,8 @@ fn what_lies_outside_or_is_no_file() {
         ("render in/device.xml", &["in/device.xml:2", "outside"]),
         ("render in/piped.xml", &["pipe.xml", "not a regular file"]),
         ("render in/piped-mesh.xml", &["pipe.obj", "not a regular file"]),
+        ("render in/piped-texture.xml", &["in/piped-texture.xml:", "pipe.png", "not a regular file"]),
+        ("render in/piped-sky.xml", &["pipe.png", "not a regular file"]),
         ("render in/up.nhdr --iso 1", &["up.nhdr:6", "outside"]),
         ("render in/map-up.obj", &[&["in/map-up.mtl:2"], outside].concat()),
         ("render in/map-absolute.obj", &[&["in/map-absolute.mtl:2"], outside].concat()),

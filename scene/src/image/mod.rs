@@ -17,6 +17,7 @@ use rayherd_render::texture::{Bitmap, Texel};
 
 use crate::ImportError;
 use crate::description::Place;
+use crate::import::regular;
 
 /// Largest file that is read.
 const MOST_FILE: u64 = 1 << 30;
@@ -115,8 +116,8 @@ pub fn error(path: &Path, place: &Place, why: &str) -> ImportError {
 
 fn open(path: &Path) -> Result<(Format, BufReader<File>, u64), String> {
     let io = |e: std::io::Error| format!("cannot be read: {e}");
-    let mut file = File::open(path).map_err(io)?;
-    let length = file.metadata().map_err(io)?.len();
+    let (mut file, metadata) = regular::open(path).map_err(io)?;
+    let length = metadata.len();
     if length > MOST_FILE {
         return Err(format!("has {length} bytes; at most {MOST_FILE} are read: make it smaller"));
     }

@@ -15,7 +15,7 @@ mod options;
 mod placement;
 mod ply;
 mod refraction;
-mod regular;
+pub(crate) mod regular;
 mod serialized;
 mod shapes;
 mod sky;

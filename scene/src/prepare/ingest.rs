@@ -153,7 +153,27 @@ pub(crate) fn ingest(
         hasher.update(attributes.finalize().as_bytes());
     }
     let Reader { spool, counts, lo, hi, dark, emissive, glows, .. } = reader;
+    // where there is nothing at all, that is said instead
+    if counts.triangles + counts.spheres > 0 {
+        lit(description, &emissive)?;
+    }
     Ok(Ingested { spool, counts, lo, hi, dark, emissive, glows, hash: hasher.finalize() })
+}
+
+/// Tells of shapes that emit and have no area; an error where nothing else emits.
+fn lit(description: &Description, emissive: &[EmissivePrimitive]) -> Result<(), PrepareError> {
+    let mut lit = vec![false; description.shapes.len()];
+    emissive.iter().for_each(|e| lit[e.shape as usize] = true);
+    let unlit: Vec<_> = description.shapes.iter().zip(&lit).filter(|(s, lit)| emits(s.emission) && !**lit).collect();
+    let Some((first, _)) = unlit.first() else { return Ok(()) };
+    let far = description.environment.is_some() || description.sun.is_some();
+    if emissive.is_empty() && description.beams.is_empty() && !far {
+        return Err(PrepareError::Dark { shape: first.name.clone(), place: first.place.clone() });
+    }
+    for (shape, _) in unlit.iter().take(10) {
+        tracing::warn!("{}: shape {:?} emits, but has no area: it gives no light", shape.place, shape.name);
+    }
+    Ok(())
 }
 
 /// Whether an emission is light.

@@ -41,7 +41,7 @@ use rayherd_render::world::{Beam, Environment, ShapeInfo, Slide, Sun, World};
 use rayon::prelude::*;
 
 use crate::ImportError;
-use crate::description::{self, Description};
+use crate::description::{self, Description, Place};
 use crate::grid::count::{Counter, Primitives, candidates, choose};
 use crate::grid::{CellData, GridData, Lattice};
 use crate::import;
@@ -110,6 +110,16 @@ pub enum PrepareError {
         non_finite: u64,
         /// Too far away.
         out_of_range: u64,
+    },
+    /// What emits has no area.
+    #[error(
+        "{place}: shape {shape:?} emits, but has no area, and nothing else gives light: give it a size, or pass --light or --sky"
+    )]
+    Dark {
+        /// Name of the first such shape.
+        shape: String,
+        /// Where it stands.
+        place: Place,
     },
     /// A record names a shape or material that the description lacks: a mistake of the importer.
     #[error("{0}")]

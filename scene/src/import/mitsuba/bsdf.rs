@@ -10,6 +10,8 @@ use crate::import::metals;
 
 /// Mitsuba's stand-in where a shape names no material, and ours for unsupported ones.
 const DEFAULT_REFLECTANCE: f32 = 0.5;
+/// Largest eta and k of a metal: a thousand times what any has, and their fourth powers are numbers still.
+const LARGEST_INDEX: f64 = 1e5;
 
 /// What textures give of a model under construction.
 pub(super) type Textures = Vec<Textured>;
@@ -227,6 +229,16 @@ impl Converter<'_> {
         }
     }
 
+    /// Whether anything of a material is read from a texture.
+    pub(super) fn is_textured(&self, material: u32) -> bool {
+        let varies = |d: &Detail| {
+            let is_texture = |a: &Amount| matches!(a, Amount::Texture(_));
+            let weight = d.blend.as_ref().map(|b| &b.weight);
+            !d.textured.is_empty() || d.relief.is_some() || is_texture(&d.opacity) || weight.is_some_and(is_texture)
+        };
+        self.has(&self.out.materials[material as usize], &varies)
+    }
+
     /// Whether a material, or what it is made of, has a detail of a kind.
     fn has(&self, material: &Material, kind: &dyn Fn(&Detail) -> bool) -> bool {
         material.detail.as_ref().is_some_and(|detail| {
@@ -286,8 +298,8 @@ impl Converter<'_> {
             // Mitsuba's default: a perfect mirror
             (eta, k, _) => (eta.unwrap_or([0.0; 3]), k.unwrap_or([1.0; 3])),
         };
-        if eta.iter().chain(&k).any(|v| *v < 0.0) {
-            return malformed(place, "eta and k should not be negative");
+        if !eta.iter().chain(&k).all(|v| (0.0..=LARGEST_INDEX).contains(v)) {
+            return malformed(place, format!("eta and k should lie between 0 and {LARGEST_INDEX}"));
         }
         let outside = match self.property(id, "ext_eta").map(|p| (&p.value, &p.place)) {
             None => 1.0,

@@ -47,6 +47,7 @@ pub(super) fn import(path: &Path, options: &ImportOptions) -> Result<Description
         materials: BTreeMap::new(),
         textures: BTreeMap::new(),
         open: BTreeSet::new(),
+        entered: 0,
     };
     for (place, what) in &document.unknown {
         converter.unsupported(place, what, "nothing");
@@ -62,6 +63,13 @@ pub(super) fn import(path: &Path, options: &ImportOptions) -> Result<Description
 }
 
 /// State of a conversion.
+/// Deepest nesting of objects by references: the stack is finite, and ten is much already.
+const MAX_NESTING: usize = 64;
+/// Most objects, each counted as often as something refers to it: four for each of the most shapes.
+const MAX_OBJECTS: usize = 1 << 22;
+/// Most materials, a blend's parts counted as often as something refers to it; some 100 MiB.
+const MAX_MATERIALS: usize = 1 << 18;
+
 struct Converter<'a> {
     document: &'a Document,
     options: &'a ImportOptions,
@@ -73,6 +81,8 @@ struct Converter<'a> {
     textures: BTreeMap<ObjectId, Option<u32>>,
     /// Objects being converted, to find cycles of references.
     open: BTreeSet<ObjectId>,
+    /// Objects begun so far.
+    entered: usize,
 }
 
 impl<'a> Converter<'a> {
@@ -197,14 +207,25 @@ impl<'a> Converter<'a> {
         Ok(found)
     }
 
-    /// Begins an object; refuses one that contains itself by references.
+    /// Begins an object; refuses one that contains itself by references, and more than anybody has.
     fn enter(&mut self, object: ObjectId, from: &Place) -> Result<(), ImportError> {
-        if self.open.insert(object) {
-            return Ok(());
-        }
         let o = &self.document.objects[object];
-        let name = o.id.clone().unwrap_or_else(|| o.plugin.clone());
-        malformed(from, format!("references form a cycle through \"{name}\""))
+        if !self.open.insert(object) {
+            let name = o.id.clone().unwrap_or_else(|| o.plugin.clone());
+            return malformed(from, format!("references form a cycle through \"{name}\""));
+        }
+        if self.open.len() > MAX_NESTING {
+            return malformed(from, format!("references nested deeper than {MAX_NESTING}: put less between the ends"));
+        }
+        self.entered += 1;
+        if self.entered > MAX_OBJECTS || self.out.materials.len() > MAX_MATERIALS {
+            let message = format!(
+                "more than {MAX_OBJECTS} objects or {MAX_MATERIALS} materials, each counted as often as it is referred to: this is no \
+                 scene that can be read"
+            );
+            return Err(ImportError::Limit { path: from.file.clone(), message });
+        }
+        Ok(())
     }
 
     /// Ends an object: what nobody asked for is unsupported.

@@ -7,6 +7,9 @@ use super::xml::malformed;
 use crate::ImportError;
 use crate::description::Note;
 
+/// Most rays of a path; what a frame takes.
+const LARGEST_DEPTH: u32 = 65535;
+
 /// Integrators that estimate the full light transport: the same image as path tracing.
 const FULL_TRANSPORT: &[&str] = &[
     "path",
@@ -78,10 +81,16 @@ impl Converter<'_> {
             return self.aov_integrator(id);
         }
         self.out.max_depth = match self.integer(id, "max_depth")? {
-            None | Some(-1) => None,
+            None => None,
+            Some(-1) => {
+                let text =
+                    "max_depth -1 (unbounded): paths have as many rays as --max-depth says, 65 by default".into();
+                self.out.notes.push(Note { place: place.clone(), text });
+                None
+            }
             Some(n) => match u32::try_from(n) {
-                Ok(n) => Some(n),
-                Err(_) => return malformed(place, "max_depth should be -1 (unbounded) or at least 0"),
+                Ok(n) if n <= LARGEST_DEPTH => Some(n),
+                _ => return malformed(place, format!("max_depth should be -1 (unbounded) or 0 to {LARGEST_DEPTH}")),
             },
         };
         self.out.rr_depth = match self.integer(id, "rr_depth")? {

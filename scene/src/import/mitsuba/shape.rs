@@ -39,6 +39,7 @@ impl Converter<'_> {
         if !to_world.determinant().is_finite() {
             return malformed(place, "to_world is too large for floating point");
         }
+        let turned = is_turned(&to_world);
         let mut flip = self.boolean(id, "flip_normals")?.unwrap_or(false);
         let mut face_normals = self.boolean(id, "face_normals")?.unwrap_or(false);
         let mut geometry = match object.plugin.as_str() {
@@ -89,6 +90,10 @@ impl Converter<'_> {
         };
         self.ignore(id, &["silhouette_sampling_weight"]);
         self.leave(id);
+        let textured = || emission_texture.is_some() || self.is_textured(material);
+        if turned && matches!(geometry, Some(Geometry::Sphere { .. })) && textured() {
+            self.unsupported(place, "a turned sphere with a texture", "the texture as on a sphere that is not turned");
+        }
         let wanted = self.attribute_for(&object.plugin, place, material, emission_texture);
         if let Some(Geometry::MeshFile { attribute, .. }) = &mut geometry {
             *attribute = wanted;
@@ -189,6 +194,13 @@ impl Converter<'_> {
         *to_world = Affine::IDENTITY;
         Ok(Geometry::Sphere { center, radius })
     }
+}
+
+/// Whether a map turns what it moves: off its diagonal, or on it below 0, by more than files round (1e-6 of the longest).
+fn is_turned(map: &Affine) -> bool {
+    let entries = (0..3).flat_map(|r| (0..3).map(move |c| (r, c, map.0[r][c])));
+    let longest = entries.clone().map(|(.., x)| x.abs()).fold(0.0, f64::max);
+    entries.into_iter().any(|(r, c, x)| if r == c { x < 0.0 } else { x.abs() > 1e-6 * longest })
 }
 
 /// Whether the columns are at right angles and equally long, to the precision that files write (1e-4 relative), and not 0.

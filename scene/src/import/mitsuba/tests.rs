@@ -369,7 +369,9 @@ fn integrators() {
     assert!(depth("path").unwrap_err().contains("property \"other\""));
     assert!(depth("ao").unwrap_err().contains("integrator \"ao\""));
     let unbounded = "<integrator type=\"path\"><integer name=\"max_depth\" value=\"-1\"/></integrator>";
-    assert_eq!(scene(&format!("{CUBE}{unbounded}")).unwrap().max_depth, None);
+    let out = scene(&format!("{CUBE}{unbounded}")).unwrap();
+    assert_eq!(out.max_depth, None);
+    assert!(out.notes.iter().any(|n| n.text.contains("unbounded") && n.text.contains("65")), "{:?}", out.notes);
     assert_eq!(scene(&format!("{CUBE}<integrator type=\"direct\"/>")).unwrap().max_depth, Some(2));
 }
 
@@ -415,8 +417,13 @@ fn what_is_wrong_has_file_line_and_remedy() {
         ),
         (
             "<shape type=\"cube\"><bsdf type=\"conductor\"><rgb name=\"eta\" value=\"-1\"/></bsdf></shape>",
-            "not be negative",
+            "between 0 and 100000",
         ),
+        (
+            "<shape type=\"cube\"><bsdf type=\"conductor\"><rgb name=\"k\" value=\"1e39\"/></bsdf></shape>",
+            "between 0 and",
+        ),
+        ("<integrator type=\"path\"><integer name=\"max_depth\" value=\"65536\"/></integrator>", "0 to 65535"),
         ("<alias id=\"x\" as=\"y\"/>", "nothing above has this id"),
         ("<default name=\"\" value=\"y\"/>", "empty name"),
     ] {

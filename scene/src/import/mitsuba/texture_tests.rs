@@ -317,3 +317,26 @@ fn light_may_be_textured() {
     let error = spot("<float name=\"cutoff_angle\" value=\"90\"/>").unwrap_err().to_string();
     assert!(error.contains("below 90 degrees with a texture"), "{error}");
 }
+
+/// Coordinates of a sphere are those of one that is not turned: where that shows it is said.
+#[test]
+fn turned_spheres_with_textures_are_unsupported() {
+    let paint = format!("<bsdf type=\"diffuse\">{}</bsdf>", bitmap("reflectance", ""));
+    let lamp = format!("<emitter type=\"area\">{}</emitter>", bitmap("radiance", ""));
+    let plain = "<bsdf type=\"diffuse\"/>";
+    let sphere = |map: &str, inside: &str| {
+        let text = format!("<shape type=\"sphere\"><transform name=\"to_world\">{map}</transform>{inside}</shape>");
+        scene_with(&text, false).map(|_| ()).map_err(|e| e.to_string())
+    };
+    let turn = "<rotate z=\"1\" angle=\"30\"/>";
+    let moved = "<scale value=\"2\"/><translate x=\"1\" y=\"2\"/>";
+    for inside in [&paint[..], &lamp[..], plain] {
+        assert_eq!(sphere(moved, inside), Ok(()));
+    }
+    assert_eq!(sphere(turn, plain), Ok(()));
+    for map in [turn, "<rotate y=\"1\" angle=\"180\"/>"] {
+        for inside in [&paint, &lamp] {
+            assert!(sphere(map, inside).unwrap_err().contains("a turned sphere with a texture"), "{map} {inside}");
+        }
+    }
+}
