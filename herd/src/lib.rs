@@ -7,6 +7,7 @@ pub mod ledger;
 pub mod local;
 pub mod picture;
 pub mod plan;
+pub mod png_file;
 pub mod remote;
 pub mod report;
 pub mod resident;

@@ -3,7 +3,7 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use rayherd_api::{Placement, RenderJobSpec};
+use rayherd_api::{PictureFile, Placement, RenderJobSpec};
 use rayherd_render::skip::Skip;
 use rayherd_scene::manifest::Manifest;
 use rayherd_scene::objects::{ObjectRef, ObjectStore};
@@ -136,6 +136,8 @@ fn frames(job: &Job, keeper: &Arc<dyn Keeper>, progress: &dyn Progress) -> Resul
             replicas,
             near: spec.placement != Placement::None,
             buckets: job.slots.iter().sum(),
+            exposure: spec.image.writes(PictureFile::Png).then(|| spec.image.exposure.unwrap_or(0.0)),
+            exr: spec.image.writes(PictureFile::Exr),
         };
         let (at, mut report) = render(job, keeper, progress, &scene, &stage, places, &sampling, (number, picture))?;
         // known to whoever prepared the scene

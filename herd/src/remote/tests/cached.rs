@@ -173,6 +173,8 @@ fn what_a_worker_has_cached_makes_it_a_holder_and_is_read_from_s3_no_more() {
             near,
             buckets: 2,
             band: BAND,
+            exposure: None,
+            exr: true,
         };
         let holders = || -> Vec<Vec<u32>> { fleet.holders().unwrap().into_iter().take(4).collect() };
         let begin = |id: &str, near: bool| {
@@ -234,6 +236,8 @@ fn of_what_a_cache_holds_the_latest_word_counts() {
             near: true,
             buckets: 1,
             band: BAND,
+            exposure: None,
+            exr: true,
         };
         fleet.open(stage, vec![vec![0]; 4], 0);
     };
