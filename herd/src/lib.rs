@@ -11,6 +11,7 @@ pub mod png_file;
 pub mod remote;
 pub mod report;
 pub mod resident;
+pub mod scenes;
 mod shapes;
 pub mod store;
 pub mod task;

@@ -26,7 +26,7 @@ use crate::job::{JobError, JobSettings, PreparedScene, Sampling, Silent, spec as
 use crate::local::{journal, render_local};
 use crate::report;
 use crate::store::{BlockStore, FaultPlan, Faulty, MemoryStore, Patience, SceneObjects, Watched, object_key};
-use crate::{picture, png_file};
+use crate::{picture, png_file, scenes};
 
 const EXAMPLE: &str = include_str!("../../../examples/cornell-box.xml");
 const SOURCE: &str = "scenes/cornell/box.xml";
@@ -755,6 +755,10 @@ fn a_job_whose_scene_is_known_needs_its_source_no_more() {
     let shown = || cluster.runtime.block_on(cluster.stores[1].get("out/a.png")).map(|png| texels(&png));
     assert_eq!(shown().unwrap(), texels(&png));
     let scene = kept.prepared.lock().unwrap()[0].0.hash.to_string();
+    // every server knows that a job has used it
+    let marks = cluster.runtime.block_on(scenes::find(cluster.depot(None).stores())).unwrap();
+    let used = marks.all[&scene.parse().unwrap()].used.unwrap();
+    assert_eq!((marks.stores, scenes::unix_now() - used < 600), (3, true));
     cluster.runtime.block_on(cluster.stores[0].delete(&[SOURCE.to_owned(), TEXTURE.to_owned()])).unwrap();
     let again = |known: Option<String>| {
         let kept = Arc::new(Kept::default());
