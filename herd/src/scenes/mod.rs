@@ -137,9 +137,16 @@ pub async fn mark(stores: Stores<'_>, scene: &ObjectHash, now: u64) -> Result<()
     let mark = Mark { time: now, stores: stores.len() as u32 };
     let body: Bytes = serde_json::to_vec(&mark).unwrap_or_default().into();
     let done = join_all(stores.iter().map(|s| s.put(&key, body.clone()))).await;
-    let taken = done.iter().any(Result::is_ok);
-    let failed =
-        done.into_iter().filter_map(Result::err).inspect(|e| tracing::warn!("a scene is not marked: {e}")).last();
+    let (mut taken, mut failed) = (false, None);
+    for result in done {
+        match result {
+            Ok(()) => taken = true,
+            Err(e) => {
+                tracing::warn!("a scene is not marked: {e}");
+                failed = Some(e);
+            }
+        }
+    }
     failed.filter(|_| !taken).map_or(Ok(()), Err)
 }
 
