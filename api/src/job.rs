@@ -8,7 +8,7 @@ use std::collections::BTreeMap;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-use crate::{Aov, ByteSize, ImageSize, Strategy};
+use crate::{Aov, ByteSize, ImageSize, PictureFile, Strategy};
 
 /// The group and version of [`RenderJob`].
 pub const API_VERSION: &str = "rayherd.io/v1alpha1";
@@ -217,14 +217,18 @@ pub struct ImageSpec {
     /// One frame per camera, all from one prepared scene; without any, the scene's own camera or one that frames it.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub cameras: Vec<CameraSpec>,
-    /// The EXR file; a local run writes a PNG beside it. With several cameras `-NAME` or `-0001`.. comes before the extension. A cluster
-    /// writes the EXR alone, as `output/NAMESPACE/NAME/` and this path, onto each server of the job's storage.
+    /// The EXR file; the PNG stands beside it. With several cameras `-NAME` or `-0001`.. comes before the extension. A cluster writes
+    /// them as `output/NAMESPACE/NAME/` and this path, onto each server of the job's storage.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub output: Option<String>,
+    /// Which of the files are written; both by default. May change: a finished job writes what is asked for anew.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schemars(length(min = 1, max = 2), extend("default" = ["Exr", "Png"], "x-kubernetes-list-type" = "set"))]
+    pub files: Option<Vec<PictureFile>>,
     /// Layers of the EXR beside the picture; those that the scene asks for by default, and an empty list is none.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub aovs: Option<Vec<Aov>>,
-    /// Exposure of a local run's PNG in stops; 0 by default. The EXR is not changed by it.
+    /// Exposure of the PNG in stops; 0 by default. The EXR is not changed by it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[schemars(range(min = -32.0, max = 32.0), extend("default" = 0.0))]
     pub exposure: Option<f64>,
@@ -333,6 +337,13 @@ impl RenderJob {
     /// A job of the current version with this specification.
     pub fn new(spec: RenderJobSpec) -> Self {
         RenderJob { api_version: API_VERSION.into(), kind: KIND.into(), metadata: Metadata::default(), spec }
+    }
+}
+
+impl ImageSpec {
+    /// Whether this file of each picture is to be written.
+    pub fn writes(&self, file: PictureFile) -> bool {
+        self.files.as_ref().is_none_or(|files| files.contains(&file))
     }
 }
 

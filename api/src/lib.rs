@@ -8,6 +8,7 @@ pub mod aov;
 pub mod byte_size;
 pub mod image_size;
 pub mod job;
+pub mod picture_file;
 #[cfg(all(test, feature = "kube"))]
 mod reference;
 #[cfg(feature = "kube")]
@@ -24,5 +25,6 @@ pub use job::{
     API_VERSION, CameraSpec, ImageSpec, KIND, LightSpec, MANAGED_BY, Metadata, Placement, RenderJob, RenderJobSpec,
     SamplingSpec, SceneSpec, StorageSpec, WorkersSpec,
 };
+pub use picture_file::PictureFile;
 pub use strategy::Strategy;
 pub use validate::{Problem, validate, validate_local};

@@ -149,8 +149,13 @@ fn check_image(c: &mut Checks, job: &RenderJob) {
     }
     if let Some(output) = &image.output {
         c.check("spec.image.output", output.ends_with(".exr") && output.len() > 4, || {
-            format!("is {output:?}: name a file that ends in .exr (the PNG is written beside it)")
+            format!("is {output:?}: name a file that ends in .exr (the PNG stands beside it)")
         });
+    }
+    if let Some(files) = &image.files {
+        c.check("spec.image.files", !files.is_empty(), || "is empty: name Exr, Png or both".into());
+        let twice = (1..files.len()).any(|i| files[..i].contains(&files[i]));
+        c.check("spec.image.files", !twice, || "names a file twice: name each once".into());
     }
     c.range("spec.image.exposure", image.exposure, -32.0, 32.0);
 }
@@ -238,7 +243,7 @@ impl Checks {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::{ByteSize, Strategy};
+    use crate::{ByteSize, PictureFile, Strategy};
 
     const FULL: &str = "
 apiVersion: rayherd.io/v1alpha1
@@ -256,6 +261,7 @@ spec:
     - {origin: [0, 0, -5], target: [0, 0, 0], up: [1, 0, 0], fov: 40}
     output: chest.exr
     exposure: -1.5
+    files: [Exr, Png]
   sampling: {spp: 64, targetError: 0.01, maxDepth: 8, rrDepth: 5, split: 4, seed: 7}
   strategy: SchedulingGridOverlapReduced
   splits: 32
@@ -342,6 +348,7 @@ spec:
         spec.image.cameras[1].fov = 180.0;
         spec.image.cameras[1].name = Some("front".into());
         spec.image.output = Some("a.png".into());
+        spec.image.files = Some(vec![PictureFile::Png; 2]);
         spec.image.exposure = Some(f64::INFINITY);
         spec.sampling.spp = Some(1 << 25);
         spec.sampling.target_error = Some(0.0);
@@ -375,6 +382,7 @@ spec:
             "spec.image.cameras[1].up",
             "spec.image.cameras[1].fov",
             "spec.image.output",
+            "spec.image.files",
             "spec.image.exposure",
             "spec.sampling.spp",
             "spec.sampling.targetError",

@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
-use rayherd_api::{CameraSpec, RenderJob};
+use rayherd_api::{CameraSpec, ImageSpec, PictureFile, RenderJob};
 use rayherd_herd::job::spec;
 use rayherd_render::film::Layout;
 use rayherd_render::frame::Frame;
@@ -23,6 +23,10 @@ impl Shot {
     /// The PNG beside the EXR.
     pub fn png(&self) -> PathBuf {
         self.exr.with_extension("png")
+    }
+    /// Those of its files that are written.
+    pub fn written(&self, image: &ImageSpec) -> Vec<PathBuf> {
+        written(&self.exr, image)
     }
 }
 
@@ -50,6 +54,17 @@ pub fn files(job: &RenderJob) -> Vec<PathBuf> {
         output.with_file_name(format!("{stem}-{mark}.exr"))
     };
     cameras.iter().enumerate().map(numbered).collect()
+}
+
+/// Those of the files of the picture with this EXR that are written.
+pub fn written(exr: &Path, image: &ImageSpec) -> Vec<PathBuf> {
+    let wanted = PictureFile::ALL.into_iter().filter(|&file| image.writes(file));
+    let path = |file| match file {
+        // as it was named
+        PictureFile::Exr => exr.to_owned(),
+        PictureFile::Png => exr.with_extension("png"),
+    };
+    wanted.map(path).collect()
 }
 
 /// Whether each picture has a file of its own: a camera's name may be another's number.

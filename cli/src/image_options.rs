@@ -1,7 +1,7 @@
 //! Flags that say which image is wanted.
 
 use clap::Args;
-use rayherd_api::{AovList, CameraSpec, ImageSize, RenderJobSpec};
+use rayherd_api::{AovList, CameraSpec, ImageSize, PictureFile, RenderJobSpec};
 use rayherd_scene::import::CameraView;
 
 use crate::options::set;
@@ -20,6 +20,9 @@ pub struct ImageOptions {
     /// materialId, variance, cost [default: those that the scene asks for]
     #[arg(long, value_name = "NAMES")]
     pub aov: Option<AovList>,
+    /// Which files are written, names between commas [default: exr,png]
+    #[arg(long, value_name = "NAMES", value_delimiter = ',')]
+    pub files: Vec<PictureFile>,
     /// Seed of every random number [default: 0]
     #[arg(long, value_name = "N", allow_hyphen_values = true)]
     pub seed: Option<i64>,
@@ -42,6 +45,7 @@ impl ImageOptions {
             spec.image.cameras = self.camera.iter().map(camera_spec).collect();
         }
         set(&mut spec.image.aovs, self.aov.as_ref().map(|list| list.0.clone()));
+        set(&mut spec.image.files, (!self.files.is_empty()).then(|| self.files.clone()));
         set(&mut spec.sampling.seed, self.seed);
         set(&mut spec.sampling.max_depth, self.max_depth);
         set(&mut spec.sampling.rr_depth, self.rr_depth);

@@ -36,6 +36,13 @@ pub struct S3Options {
     s3_cache: Option<ByteSize>,
 }
 
+impl S3Options {
+    /// The server at this address.
+    pub fn at(url: &str) -> Self {
+        S3Options { s3_endpoint: Some(url.to_owned()), ..S3Options::default() }
+    }
+}
+
 /// An open store.
 pub struct Store {
     /// Its objects by key.

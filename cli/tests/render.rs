@@ -361,6 +361,37 @@ spec:
     assert_mistake(&rayherd(folder.path(), &["render", "bad.xml"]), &["\"depth\" should be NAME:KIND"]);
 }
 
+/// Which files are written, by a flag and by a job's file; of one alone nothing else is left, no preview either.
+#[test]
+fn files_are_chosen() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = |name: &str| folder.path().join(name);
+    let fine = |run: Run| {
+        assert_eq!(run.code, 0, "{}", run.err);
+        run.out
+    };
+    fine(cornell(folder.path(), "both.exr", &[]));
+    let told = fine(cornell(folder.path(), "one.exr", &["--files", "exr"]));
+    assert!(told.starts_with("one.exr: 16x16"), "{told}");
+    let told = fine(cornell(folder.path(), "two.exr", &["--files", "png"]));
+    assert!(told.starts_with("two.png: 16x16"), "{told}");
+    assert_eq!(files(folder.path()), ["both.exr", "both.png", "one.exr", "two.png"]);
+    assert!(fs::read(at("one.exr")).unwrap() == fs::read(at("both.exr")).unwrap());
+    assert!(fs::read(at("two.png")).unwrap() == fs::read(at("both.png")).unwrap());
+    assert_mistake(&cornell(folder.path(), "x.exr", &["--files", "exr,jpg"]), &["--files", "\"jpg\"", "exr, png"]);
+    fs::copy(repository("examples/cornell-box.xml"), at("box.xml")).unwrap();
+    let job = "{apiVersion: rayherd.io/v1alpha1, kind: RenderJob, spec: {scene: {source: box.xml}, \
+        image: {size: 16x16, output: job.exr, files: [Png]}, sampling: {spp: 4}}}";
+    fs::write(at("job.yaml"), job).unwrap();
+    fine(rayherd(folder.path(), &["render", "-f", "job.yaml"]));
+    assert!(!at("job.exr").exists());
+    assert!(fs::read(at("job.png")).unwrap() == fs::read(at("both.png")).unwrap());
+    for (files, why) in [("[]", "is empty"), ("[Exr, Exr]", "twice")] {
+        fs::write(at("bad.yaml"), job.replace("[Png]", files)).unwrap();
+        assert_mistake(&rayherd(folder.path(), &["render", "-f", "bad.yaml"]), &["spec.image.files", why]);
+    }
+}
+
 /// They go on with more samples, and are another picture than one with others.
 #[test]
 fn aovs_are_resumed() {

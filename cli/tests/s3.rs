@@ -236,6 +236,33 @@ fn a_bucket_serves_as_a_folder_does() {
     assert!(gc.code == 0 && !gc.out.contains(": 0 objects deleted"), "{}{}", gc.out, gc.err);
 }
 
+/// What lies on one of a cluster's servers may be named on another: one alone is refused, all together are collected.
+#[test]
+fn a_cluster_is_collected_as_a_whole() {
+    let servers = [Server::start(), Server::start()];
+    let url = |n: usize| servers[n].server.settings("").endpoint.unwrap();
+    let (store, folder) = (format!("s3://{BUCKET}/herd"), tempfile::tempdir().unwrap());
+    let folder = folder.path();
+    let prepare = ["prepare", &scene(), "--size", "8x8", "--splits", "2", "--store", &store];
+    assert_eq!(servers[0].run(folder, &prepare).code, 0);
+    for Server { server, .. } in &servers {
+        // as the operator marks a scene that is used, on all servers; this one is gone
+        server.put_raw(&format!("herd/uses/{}", "1".repeat(64)), b"{\"time\":1,\"stores\":2}");
+        server.put_raw(&format!("herd/objects/00/{}", "0".repeat(64)), b"stray");
+    }
+    for server in &servers {
+        let alone = server.run(folder, &["gc", &store]);
+        assert_mistake(&alone, &["one of 2", "nothing is deleted", "--server"]);
+    }
+    let all = servers[0].run(folder, &["gc", &store, "--server", &url(1)]);
+    assert!(all.code == 0 && all.out.contains(": 2 objects deleted, 10 B; "), "{}{}", all.out, all.err);
+    let again = servers[1].run(folder, &["gc", &store, "--server", &url(0)]);
+    assert!(again.code == 0 && again.out.contains(": 0 objects deleted"), "{}{}", again.out, again.err);
+    let whole = servers[0].run(folder, &["inspect", &store]);
+    assert_eq!(whole.code, 0, "{}", whole.err);
+    assert_mistake(&common::rayherd(folder, &["gc", &store, "--server", &url(1)]), &["--s3-endpoint"]);
+}
+
 /// A memory of one split of three: each is read again and again, over the network or from the cache; the file is the same.
 #[test]
 fn what_memory_drops_is_fetched_once_with_a_cache() {

@@ -12,9 +12,13 @@ pub const LONGEST: Duration = Duration::from_secs(120);
 
 /// The rest after so many failures in a row: doubled each time up to [`LONGEST`], of which each has its own part from half to all.
 pub fn rest(first: Duration, failures: u32, who: &str) -> Duration {
-    let whole = first.saturating_mul(1 << failures.saturating_sub(1).min(16)).min(LONGEST);
+    part(first.saturating_mul(1 << failures.saturating_sub(1).min(16)).min(LONGEST), who, failures)
+}
+
+/// From half of a time to all of it: another part for each, and each time.
+pub fn part(whole: Duration, who: &str, number: u32) -> Duration {
     let mut hasher = DefaultHasher::new();
-    (who, failures).hash(&mut hasher);
+    (who, number).hash(&mut hasher);
     let thousandths = (hasher.finish() % 1001) as u32;
     whole / 2 + whole / 2 * thousandths / 1000
 }

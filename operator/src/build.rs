@@ -419,6 +419,7 @@ mod tests {
             listen: "127.0.0.1:0".parse().unwrap(),
             metrics: "127.0.0.1:0".parse().unwrap(),
             watch: None,
+            scene_days: 30,
         }
     }
 

@@ -25,7 +25,14 @@ pub struct Config {
     pub metrics: SocketAddr,
     /// The one namespace whose jobs are run; all if none.
     pub watch: Option<String>,
+    /// Days after which a prepared scene goes that no job names or uses; 0 for never.
+    pub scene_days: u32,
 }
+
+/// Unless the environment says otherwise.
+const SCENE_DAYS: u32 = 30;
+/// A hundred years.
+const MOST_DAYS: u32 = 36_500;
 
 impl Config {
     /// The host of [`Config::url`], which the task server's certificate is for.
@@ -49,6 +56,9 @@ impl Config {
             let text = variable(name).unwrap_or_else(|| default.into());
             text.parse().with_context(|| format!("{name} is {text:?}: give address:port"))
         };
+        let days = variable("RAYHERD_SCENE_DAYS");
+        let scene_days = days.as_ref().map_or(Ok(SCENE_DAYS), |text| text.parse()).ok().filter(|d| *d <= MOST_DAYS);
+        let days = days.unwrap_or_default();
         Ok(Config {
             namespace: need("RAYHERD_NAMESPACE")?,
             pod: need("RAYHERD_POD")?,
@@ -59,6 +69,9 @@ impl Config {
             listen: address("RAYHERD_LISTEN", "0.0.0.0:8443")?,
             metrics: address("RAYHERD_METRICS", "0.0.0.0:9090")?,
             watch: variable("RAYHERD_WATCH_NAMESPACE"),
+            scene_days: scene_days.with_context(|| {
+                format!("RAYHERD_SCENE_DAYS is {days:?}: give days from 1 to {MOST_DAYS}, or 0 to keep prepared scenes for ever")
+            })?,
         })
     }
 }

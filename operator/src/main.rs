@@ -12,6 +12,7 @@ mod lease;
 mod ledger;
 mod metrics;
 mod reconcile;
+mod retention;
 mod run;
 mod status;
 mod storage;
@@ -111,6 +112,7 @@ async fn run() -> anyhow::Result<()> {
     leads(&context, true).await?;
     let left = context.left.clone();
     tokio::spawn(async move { left.keep().await });
+    tokio::spawn(retention::keep(context.clone()));
     context.metrics.leader.set(1);
 
     let watch = || watcher::Config::default().timeout(WATCH_SECONDS);

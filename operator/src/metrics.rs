@@ -31,6 +31,8 @@ pub struct Metrics {
     pub watch_errors: IntCounter,
     /// Jobs that were begun, or gone on with.
     pub started: IntCounter,
+    /// Prepared scenes that were deleted since nobody used them.
+    pub scenes_deleted: IntCounter,
     /// Reports that nobody waits for (any more).
     pub ignored: IntCounter,
     refused: IntCounterVec,
@@ -124,6 +126,10 @@ impl Metrics {
             errors: counter("rayherd_reconcile_errors_total", "reconcile steps that failed")?,
             watch_errors: counter("rayherd_watch_errors_total", "watches of the API server that failed")?,
             started: counter("rayherd_jobs_started_total", "jobs that were begun or gone on with")?,
+            scenes_deleted: counter(
+                "rayherd_scenes_deleted_total",
+                "prepared scenes that went since nobody used them",
+            )?,
             ignored: counter("rayherd_worker_reports_ignored_total", "reports of work that nobody waits for")?,
             refused,
             asked,

@@ -29,6 +29,7 @@ use crate::finish::{self, Leftovers};
 use crate::jobs::{Jobs, Running, State};
 use crate::kills::{Kill, kills};
 use crate::metrics::Metrics;
+use crate::retention::Storages;
 use crate::run;
 use crate::status;
 use crate::storage::{self, StorageError};
@@ -69,6 +70,8 @@ pub struct Context {
     pub turns: Arc<Turns>,
     /// What is left of deleted jobs in storages whose servers were away.
     pub left: Arc<Leftovers>,
+    /// Storages that jobs have used.
+    pub storages: Storages,
     /// Steps that failed in a row, by job.
     pub failures: Failures,
     /// Whether what happens is still seen.
@@ -85,8 +88,8 @@ impl Context {
         let (jobs, trusted, turns, left) = (Jobs::default(), RwLock::default(), Arc::default(), Arc::default());
         let reporter = Reporter { controller: "rayherd-operator".into(), instance: Some(config.pod.clone()) };
         let events = Recorder::new(client.clone(), reporter);
-        let (failures, watching) = (Failures::default(), Watching::default());
-        Context { client, config, jobs, trusted, turns, left, failures, watching, events, metrics }
+        let (storages, failures, watching) = (Storages::default(), Failures::default(), Watching::default());
+        Context { client, config, jobs, trusted, turns, left, storages, failures, watching, events, metrics }
     }
     /// Objects of every namespace that is watched.
     pub fn everywhere<K>(&self) -> Api<K>
@@ -377,6 +380,7 @@ async fn start(
     // an earlier operator may have left something there
     let (left, of_task) = (context.left.clone(), depot.clone());
     tokio::spawn(async move { left.find(&of_task).await });
+    context.storages.add(&storage, &depot);
     let running = run::start(context.client.clone(), job, storage, depot, context.turns.clone(), before);
     context.jobs.insert(uid, running.clone());
     context.metrics.started.inc();

@@ -23,7 +23,7 @@ use crate::metrics::Metrics;
 use crate::reconcile::{Context, FINALIZER, Seen, reconcile};
 
 /// One request that must come, and its answer.
-struct Step {
+pub struct Step {
     method: &'static str,
     path: &'static str,
     /// What must be in the body, by JSON pointer.
@@ -32,7 +32,7 @@ struct Step {
     answer: Value,
 }
 
-fn step(method: &'static str, path: &'static str, status: u16, answer: Value) -> Step {
+pub fn step(method: &'static str, path: &'static str, status: u16, answer: Value) -> Step {
     Step { method, path, body: vec![], status, answer }
 }
 
@@ -43,10 +43,10 @@ impl Step {
     }
 }
 
-type Server = Mock<Request<Body>, Response<Body>>;
+pub type Server = Mock<Request<Body>, Response<Body>>;
 
 /// Answers these requests in their order, and sees that no other comes. What each said is handed back.
-async fn serve(mut server: Server, steps: Vec<Step>) -> Vec<Value> {
+pub async fn serve(mut server: Server, steps: Vec<Step>) -> Vec<Value> {
     let mut said = Vec::new();
     for (number, step) in steps.into_iter().enumerate() {
         let next = tokio::time::timeout(Duration::from_secs(20), server.next_request()).await;
@@ -78,7 +78,7 @@ async fn serve(mut server: Server, steps: Vec<Step>) -> Vec<Value> {
     said
 }
 
-fn context() -> (Arc<Context>, Server) {
+pub fn context() -> (Arc<Context>, Server) {
     let (service, server) = mock::pair::<Request<Body>, Response<Body>>();
     let config = Config {
         namespace: "rayherd".into(),
@@ -90,13 +90,14 @@ fn context() -> (Arc<Context>, Server) {
         listen: "127.0.0.1:0".parse().unwrap(),
         metrics: "127.0.0.1:0".parse().unwrap(),
         watch: None,
+        scene_days: 30,
     };
     let metrics = Metrics::new().unwrap();
     let service = metrics.requests().layer(service);
     (Arc::new(Context::new(Client::new(service, "default"), config, metrics)), server)
 }
 
-fn job() -> Value {
+pub fn job() -> Value {
     json!({
         "apiVersion": "rayherd.io/v1alpha1",
         "kind": "RenderJob",
@@ -109,7 +110,7 @@ fn object(value: &Value) -> Arc<RenderJobObject> {
     Arc::new(serde_json::from_value(value.clone()).unwrap())
 }
 
-fn not_found() -> Value {
+pub fn not_found() -> Value {
     json!({"kind": "Status", "apiVersion": "v1", "status": "Failure", "reason": "NotFound", "code": 404, "message": "none"})
 }
 
@@ -132,7 +133,7 @@ fn event(kind: &'static str, reason: &'static str) -> Step {
 
 const STATUS: &str = "/apis/rayherd.io/v1alpha1/namespaces/studio/renderjobs/box/status?";
 const JOB: &str = "/apis/rayherd.io/v1alpha1/namespaces/studio/renderjobs/box?";
-const PROFILE: &str = "/api/v1/namespaces/rayherd/configmaps/rayherd-storage-default";
+pub const PROFILE: &str = "/api/v1/namespaces/rayherd/configmaps/rayherd-storage-default";
 const SECRET: &str = "/api/v1/namespaces/studio/secrets/rayherd-storage";
 const PODS: &str = "/api/v1/namespaces/studio/pods?&labelSelector=rayherd.io%2Fjob%3Du-1";
 

@@ -152,6 +152,7 @@ def namespaced(r, _):
     assert grants(r.one("Role", "rayherd-own"))[("", "pods")] == {"get", "patch"}
     env = r.one("Deployment", "rayherd-operator")["spec"]["template"]["spec"]["containers"][0]["env"]
     assert {"name": "RAYHERD_WATCH_NAMESPACE", "value": JOBS} in env
+    assert {"name": "RAYHERD_SCENE_DAYS", "value": "30"} in env
 
 
 def policies(r, _):
@@ -315,6 +316,7 @@ SETS = {
 REFUSED = [
     ({"replicas": "none"}, "replicas"),
     ({"replicas": 0}, "replicas"),
+    ({"sceneDays": -1}, "sceneDays"),
     ({"imagePullPolicy": "Sometimes"}, "imagePullPolicy"),
     ({"imagee": "x"}, "imagee"),
     ({"storage.default.bucket": "x"}, "bucket"),

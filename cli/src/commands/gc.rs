@@ -3,13 +3,14 @@
 use std::collections::BTreeSet;
 use std::path::Path;
 use std::process::ExitCode;
+use std::sync::Arc;
 
 use anyhow::Context;
 use clap::Args;
 use rayherd_herd::local::{Collected, collect};
-use rayherd_herd::store::object_key;
-use rayherd_scene::manifest::Manifest;
-use rayherd_scene::objects::{DirectoryObjects, ObjectHash};
+use rayherd_herd::scenes;
+use rayherd_herd::store::{BlockStore, object_key, promised_hash};
+use rayherd_scene::objects::DirectoryObjects;
 
 use super::{print, size};
 use crate::fault::Mistake;
@@ -18,16 +19,20 @@ use crate::store::{JOBS, S3Options, Store};
 /// Delete what nothing in a store names: losing attempts, consumed rays, half-written files
 ///
 /// Objects of no scene go too. A job that is being written is refused. Do not prepare a scene into the store at the same time: its objects have no
-/// name until it is complete.
+/// name until it is complete. The storage of a cluster lies on several servers, of which each may hold what another names: name all of them.
 #[derive(Args)]
 #[command(
-    after_help = "Examples:\n  rayherd gc results\n  rayherd gc s3://bucket/renders --s3-endpoint http://localhost:9000"
+    after_help = "Examples:\n  rayherd gc results\n  rayherd gc s3://bucket/renders --s3-endpoint http://localhost:9000\n  \
+    rayherd gc s3://rayherd --s3-endpoint http://localhost:9000 --server http://localhost:9001 --server http://localhost:9002"
 )]
 pub struct Arguments {
     /// A folder, or s3://bucket/prefix
     store: String,
     #[command(flatten)]
     s3: S3Options,
+    /// Another server of the same storage, beside that of --s3-endpoint; repeatable
+    #[arg(long, value_name = "URL", requires = "s3_endpoint")]
+    server: Vec<String>,
 }
 
 /// Collects jobs first, then objects.
@@ -40,34 +45,42 @@ pub fn run(arguments: &Arguments) -> anyhow::Result<ExitCode> {
     if !place.starts_with("s3://") && folder.is_dir() && !["names", "objects", JOBS].into_iter().any(holds) {
         return Err(nothing().into());
     }
-    let store = Store::existing(place, &arguments.s3)?;
-    let jobs = jobs(&store)?;
+    let first = Store::existing(place, &arguments.s3)?;
+    let others = arguments
+        .server
+        .iter()
+        .map(|url| Store::existing(place, &S3Options::at(url)))
+        .collect::<Result<Vec<_>, _>>()?;
+    let all: Vec<&Store> = std::iter::once(&first).chain(&others).collect();
+    let stores: Vec<Arc<dyn BlockStore>> = all.iter().map(|s| s.blocks.clone()).collect();
+    let jobs = all.iter().map(|store| jobs(store)).collect::<Result<Vec<_>, _>>()?;
     // a first preparing that was killed leaves objects without a name
-    let has_objects = || -> anyhow::Result<bool> {
-        Ok(store.wait(store.blocks.list("objects/"))?.iter().any(|(key, _)| is_object_key(key)))
+    let has_objects = |store: &Store| -> anyhow::Result<bool> {
+        let is_object = |key: &str| promised_hash(key).is_some_and(|hash| object_key(&hash) == key);
+        Ok(store.wait(store.blocks.list("objects/"))?.iter().any(|(key, _)| is_object(key)))
     };
-    if jobs.is_empty() && !store.objects.names()?.iter().any(|n| n.starts_with("scene-")) && !has_objects()? {
-        return Err(nothing().into());
+    if jobs.iter().all(BTreeSet::is_empty) && first.wait(scenes::find(&stores))?.all.is_empty() {
+        let mut any = false;
+        for store in &all {
+            any |= has_objects(store)?;
+        }
+        if !any {
+            return Err(nothing().into());
+        }
     }
     let mut total = Collected::default();
-    for job in jobs {
-        let done = store.wait(collect(store.part(&job)?)).with_context(|| format!("cannot collect {job}"))?;
+    let mut add = |done: Collected| {
         total.objects += done.objects;
         total.bytes += done.bytes;
         total.kept += done.kept;
-    }
-    let named = named(&store)?;
-    let mut garbage = Vec::new();
-    for (key, bytes) in store.wait(store.blocks.list("objects/"))? {
-        if named.contains(&key) || !is_object_key(&key) {
-            total.kept += 1;
-        } else {
-            total.objects += 1;
-            total.bytes += bytes;
-            garbage.push(key);
+    };
+    for (store, jobs) in all.iter().zip(jobs) {
+        for job in jobs {
+            add(store.wait(collect(store.part(&job)?)).with_context(|| format!("cannot collect {job}"))?);
         }
     }
-    store.wait(store.blocks.delete(&garbage))?;
+    let told = || format!("cannot collect the scenes of {place} (--server names further servers)");
+    add(first.wait(scenes::collect(&stores)).with_context(told)?);
     if !place.starts_with("s3://") {
         let (files, bytes) = DirectoryObjects::open(place)?.remove_unfinished()?;
         total.objects += files;
@@ -78,12 +91,6 @@ pub fn run(arguments: &Arguments) -> anyhow::Result<ExitCode> {
     Ok(ExitCode::SUCCESS)
 }
 
-/// Whether a key is one that an object of ours has, by its form: `objects/ab/abcd..`, 64 digits.
-fn is_object_key(key: &str) -> bool {
-    let hex = key.rsplit('/').next().unwrap_or_default();
-    hex.parse().is_ok_and(|hash: ObjectHash| object_key(&hash) == key)
-}
-
 /// Prefixes of the jobs: what has records, or the owner that a first one is about to have.
 fn jobs(store: &Store) -> anyhow::Result<BTreeSet<String>> {
     let keys = store.wait(store.blocks.list(JOBS))?;
@@ -92,18 +99,4 @@ fn jobs(store: &Store) -> anyhow::Result<BTreeSet<String>> {
         (rest == "owner" || rest.starts_with("records/")).then(|| format!("{JOBS}{job}"))
     };
     Ok(keys.iter().filter_map(|(key, _)| job(key)).collect())
-}
-
-/// Keys of all objects that belong to a prepared scene with a name.
-fn named(store: &Store) -> anyhow::Result<BTreeSet<String>> {
-    let mut keys = BTreeSet::new();
-    for name in store.objects.names()? {
-        let Some(object) = store.objects.name(&name)? else { continue };
-        keys.insert(object_key(&object.hash));
-        // one that cannot be read must not cost the objects of which it is the only list
-        let manifest = Manifest::load(store.objects.as_ref(), &object);
-        let manifest = manifest.with_context(|| format!("{name}: delete this name to give the scene up"))?;
-        keys.extend(manifest.objects().map(|o| object_key(&o.hash)));
-    }
-    Ok(keys)
 }

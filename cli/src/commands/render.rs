@@ -6,12 +6,13 @@ use std::process::ExitCode;
 
 use anyhow::Context;
 use clap::Args;
-use rayherd_api::{RenderJob, RenderJobSpec};
+use rayherd_api::{ImageSpec, PictureFile, RenderJob, RenderJobSpec};
 use rayherd_herd::job::spec;
 use rayherd_herd::job::{Commits, JobSettings, PreparedScene, Sampling};
 use rayherd_herd::local::{JobOutcome, render_local};
 use rayherd_herd::picture;
 use rayherd_herd::report::{Kind, Op, Report};
+use rayherd_render::frame::Frame;
 use rayherd_render::skip::Skip;
 use rayherd_scene::prepare::{ByteKind, ByteOp, ByteRow, Prepared};
 use serde_json::json;
@@ -60,7 +61,7 @@ pub struct Arguments {
     /// names a server where the profile's are inside the cluster
     #[arg(long, value_name = "YAML", requires = "file", conflicts_with_all = ["scene", "local"])]
     profile: Option<PathBuf>,
-    /// The EXR; the PNG goes beside it [default: ./SCENE.exr]
+    /// The EXR; the PNG goes beside it (see --files) [default: ./SCENE.exr]
     #[arg(short, long, value_name = "EXR")]
     output: Option<String>,
     /// Exposure of the PNG in stops [default: 0]
@@ -127,7 +128,7 @@ pub fn run(arguments: &Arguments) -> anyhow::Result<ExitCode> {
     use_threads(settings.threads)?;
     let files = frames::files(&job);
     frames::check_files(&files)?;
-    let mut outputs: Vec<PathBuf> = files.iter().flat_map(|exr| [exr.clone(), exr.with_extension("png")]).collect();
+    let mut outputs: Vec<PathBuf> = files.iter().flat_map(|exr| frames::written(exr, &job.spec.image)).collect();
     outputs.iter().try_for_each(|path| replace::probe(path, "-o"))?;
     for (path, flag) in [(&arguments.preview, "--preview"), (&arguments.report, "--report")] {
         if let Some(path) = path {
@@ -176,28 +177,29 @@ pub fn run(arguments: &Arguments) -> anyhow::Result<ExitCode> {
     }
     let mut reports = Vec::new();
     for (shot, (image, about)) in shots.iter().zip(&names) {
-        let preview = arguments.preview.clone().unwrap_or_else(|| shot.png());
+        let png = || job.spec.image.writes(PictureFile::Png).then(|| shot.png());
+        let preview = arguments.preview.clone().or_else(png).map(|path| (path, exposure));
         if let Some(store) = &store {
             kept::note(store, image, about)?;
         }
         let store = store.as_ref().map(|store| store.job(image)).transpose()?;
         let commits = store.map(|store| Commits { store, resume: keep.resume, takeover: keep.takeover });
         let settings = JobSettings { commits, ..settings.clone() };
-        let mut outcome = render(&scene, shot, &sampling, &settings, (preview, exposure))?;
+        let mut outcome = render(&scene, shot, &sampling, &settings, preview)?;
         outcome.report.prepare = prepare_report(&prepared);
         outcome.report.spilled_bytes += vertices_spilled + temporary.as_ref().map_or(0, Temporary::spilled);
         for (skip, count) in [(Skip::Prepared, prepared.kept()), (Skip::Volume, cells_passed)] {
             outcome.report.skips.insert(skip.name().to_owned(), count);
         }
         outcome.report.add_prepare_bytes(prepared.report.bytes.iter().map(prepare_row));
-        let saved = save(&scene, shot, &outcome, exposure);
+        let saved = save(&scene, shot, &outcome, &job.spec.image);
         match &keep.store {
             Some(place) => {
                 saved.with_context(|| format!("all samples are kept in {place}, run again with --resume"))?
             }
             None => saved?,
         }
-        tell(shot, &outcome.report, &sampling)?;
+        tell(&shot.written(&job.spec.image), &shot.frame, &outcome.report, &sampling)?;
         reports.push(outcome.report);
     }
     if let Some(path) = &arguments.report {
@@ -252,10 +254,10 @@ fn render(
     shot: &Shot,
     sampling: &Sampling,
     settings: &JobSettings,
-    preview: (PathBuf, f64),
+    preview: Option<(PathBuf, f64)>,
 ) -> anyhow::Result<JobOutcome> {
     let [width, height] = shot.frame.size;
-    let display = Display::new(u64::from(width) * u64::from(height), sampling.target_error, Some(preview));
+    let display = Display::new(u64::from(width) * u64::from(height), sampling.target_error, preview);
     let heeding = Heeding::begin();
     let outcome = render_local(scene, &shot.frame, sampling, settings, &display);
     drop(heeding);
@@ -276,15 +278,20 @@ fn render(
     })
 }
 
-fn save(scene: &PreparedScene, shot: &Shot, outcome: &JobOutcome, exposure: f64) -> anyhow::Result<()> {
+fn save(scene: &PreparedScene, shot: &Shot, outcome: &JobOutcome, image: &ImageSpec) -> anyhow::Result<()> {
+    if image.writes(PictureFile::Png) {
+        replace::replace_or_keep(&shot.png(), &png_file::encode(&outcome.image, image.exposure.unwrap_or(0.0))?)?;
+    }
+    if !image.writes(PictureFile::Exr) {
+        return Ok(());
+    }
     let mut definition = spec::definition(&scene.manifest, &shot.frame, outcome.spp)?;
     if !scene.skips().makes(Skip::Lights) {
         // the frame says nothing of it
         definition.insert("no_skip".to_owned(), json!([Skip::Lights.name()]));
     }
     let channels = outcome.film.channels(outcome.spp, scene.manifest.offset);
-    replace::replace_or_keep(&shot.exr, &picture::encode(&outcome.image, &channels, &definition)?)?;
-    replace::replace_or_keep(&shot.png(), &png_file::encode(&outcome.image, exposure)?)
+    replace::replace_or_keep(&shot.exr, &picture::encode(&outcome.image, &channels, &definition)?)
 }
 
 fn prepare_report(prepared: &Prepared) -> serde_json::Value {
@@ -320,8 +327,9 @@ fn prepare_row(row: &ByteRow) -> (Op, Kind, u64) {
 }
 
 /// Where the pictures are, how noisy, what it took.
-fn tell(shot: &Shot, report: &Report, sampling: &Sampling) -> anyhow::Result<()> {
-    let [width, height] = shot.frame.size;
+fn tell(files: &[PathBuf], frame: &Frame, report: &Report, sampling: &Sampling) -> anyhow::Result<()> {
+    let [width, height] = frame.size;
+    let files: Vec<String> = files.iter().map(|path| path.display().to_string()).collect();
     let error = report.rel_mse.map_or_else(|| "relMSE unknown".into(), |e| format!("relMSE {e:.2e}"));
     let target = match (report.target_reached, sampling.target_error) {
         (Some(true), Some(target)) => format!(" (target {target} reached)"),
@@ -330,9 +338,8 @@ fn tell(shot: &Shot, report: &Report, sampling: &Sampling) -> anyhow::Result<()>
     };
     let rays = report.rays.closest + report.rays.shadow;
     print(&format!(
-        "{} and {}: {width}x{height}, {} spp, {error}{target}, {} rays, {:.2} CPU-seconds\n",
-        shot.exr.display(),
-        shot.png().display(),
+        "{}: {width}x{height}, {} spp, {error}{target}, {} rays, {:.2} CPU-seconds\n",
+        files.join(" and "),
         report.spp,
         si(rays as f64),
         report.cpu_s

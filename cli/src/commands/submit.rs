@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use anyhow::Context;
 use clap::Args;
-use rayherd_api::{RenderJob, RenderJobSpec, Strategy};
+use rayherd_api::{PictureFile, RenderJob, RenderJobSpec, Strategy};
 use rayherd_scene::inspect::size;
 
 use super::print;
@@ -46,7 +46,8 @@ pub struct Arguments {
     /// Wait for the end and show how far it is
     #[arg(short, long)]
     watch: bool,
-    /// Fetch the picture when it is done; wants --watch and --store. Of several cameras each has a file of its own, FILE-CAMERA.exr
+    /// Fetch the picture when it is done, the PNG if FILE ends in .png, else the EXR; wants --watch and --store. Of several cameras each has
+    /// a file of its own, FILE-CAMERA.exr
     #[arg(short, long, value_name = "FILE", requires = "watch", requires = "store")]
     output: Option<PathBuf>,
     #[command(flatten)]
@@ -89,6 +90,7 @@ pub fn run(arguments: &Arguments) -> anyhow::Result<ExitCode> {
     // before anything is sent: what is wrong with a flag, or with the way to the cluster
     if let Some(output) = &arguments.output {
         replace::probe(output, "-o")?;
+        check_written(&job, output)?;
     }
     let cluster = Cluster::connect(&arguments.cluster)?;
     if !is_job {
@@ -115,13 +117,33 @@ pub fn run(arguments: &Arguments) -> anyhow::Result<ExitCode> {
     Ok(ExitCode::SUCCESS)
 }
 
+/// Which of the picture's files goes to a file here.
+fn kind_of(output: &Path) -> PictureFile {
+    if output.extension().is_some_and(|e| e == "png") { PictureFile::Png } else { PictureFile::Exr }
+}
+
+fn check_written(job: &RenderJob, output: &Path) -> Result<(), Mistake> {
+    let kind = kind_of(output).extension();
+    if job.spec.image.writes(kind_of(output)) {
+        return Ok(());
+    }
+    let path = output.display();
+    Err(Mistake(format!(
+        "-o {path} is to be the {kind}, which this job does not write: name {kind} in --files (spec.image.files) too"
+    )))
+}
+
 /// Key in the storage and file here of each picture of a job that has a name.
 fn pictures(job: &RenderJob, namespace: &str, output: &Path) -> Vec<(String, PathBuf)> {
     let name = job.metadata.name.clone().unwrap_or_default();
     let mut here = job.clone();
     here.spec.image.output = Some(output.to_string_lossy().into_owned());
-    let key = |there: PathBuf| format!("output/{namespace}/{name}/{}", there.display());
-    frames::files(job).into_iter().map(key).zip(frames::files(&here)).collect()
+    let extension = kind_of(output).extension();
+    let key = |there: PathBuf| format!("output/{namespace}/{name}/{}", there.with_extension(extension).display());
+    let paths = frames::files(&here).into_iter();
+    // a single one is named as it was given
+    let paths = paths.map(|path| if path == output { path } else { path.with_extension(extension) });
+    frames::files(job).into_iter().map(key).zip(paths).collect()
 }
 
 /// Shows each change until the job has come to its end.
@@ -175,5 +197,13 @@ mod tests {
                 pair("output/studio/box/film/part-0002.exr", "a/b-0002.exr"),
             ]
         );
+        // the PNG, where the name asks for it
+        let of_png = pictures(&job, "b.png");
+        assert_eq!(of_png[0], pair("output/studio/box/film/part-left.png", "b-left.png"));
+        check_written(&job, Path::new("b.png")).unwrap();
+        job.spec.image.files = Some(vec![PictureFile::Exr]);
+        check_written(&job, Path::new("b")).unwrap();
+        let error = check_written(&job, Path::new("b.png")).unwrap_err().to_string();
+        assert!(error.contains("b.png") && error.contains("--files"), "{error}");
     }
 }

@@ -2,5 +2,6 @@
 
 pub mod distinct;
 pub mod exr_file;
-pub mod png_file;
 pub mod replace;
+
+pub use rayherd_herd::png_file;

@@ -81,7 +81,7 @@ impl Adder<'_> {
     }
 
     /// Writes the picture of `samples` samples per pixel with the layers of its AOVs, from the top down; `offset` as for
-    /// [`FilmPart::channels`].
+    /// [`FilmPart::channels`]. What is `seen` are the rows as they are written.
     ///
     /// # Errors
     /// When a part cannot be read, or the picture cannot be written.
@@ -92,6 +92,7 @@ impl Adder<'_> {
         offset: [f64; 3],
         definition: &Map<String, Value>,
         out: impl Write + Seek,
+        mut seen: impl FnMut(&[[f32; 3]]) -> Result<(), JobError>,
     ) -> Result<Totals, JobError> {
         let Layout { size: [width, height], aovs } = self.layout;
         let across = width.div_ceil(TILE);
@@ -121,7 +122,7 @@ impl Adder<'_> {
                 }
             }
             row.copy_from(&rows, at(0, y));
-            Ok(())
+            seen(&row.light)
         };
         picture::write([width, height], &beside, definition, next, out)?;
         Ok(totals)

@@ -3,10 +3,10 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use rayherd_api::{Placement, RenderJobSpec};
+use rayherd_api::{PictureFile, Placement, RenderJobSpec};
 use rayherd_render::skip::Skip;
 use rayherd_scene::manifest::Manifest;
-use rayherd_scene::objects::{ObjectRef, ObjectStore};
+use rayherd_scene::objects::{ObjectHash, ObjectRef, ObjectStore};
 use tokio::runtime::Handle;
 
 use super::bands;
@@ -22,6 +22,7 @@ use crate::local::attempt::{FilmUse, Shared};
 use crate::local::journal;
 use crate::local::nodes::Nodes;
 use crate::report;
+use crate::scenes;
 use crate::store::{BlockStore, SceneObjects, StoreError, object_key};
 
 /// How long the first plan of a frame waits for workers that are not there yet.
@@ -95,6 +96,8 @@ fn frames(job: &Job, keeper: &Arc<dyn Keeper>, progress: &dyn Progress) -> Resul
             "spec.replicas is {replicas}, but the storage has {servers} server(s): ask for at most one copy on each"
         )));
     }
+    // until it is known which scene it is, and that is marked
+    let looking = job.turns.look(|| job.fleet.check())?;
     let (reference, reused, cells_passed) = match (known(job, replicas)?, &spec.scene.prepared) {
         (Some(known), _) => (known, true, 0),
         (None, Some(hash)) => {
@@ -104,8 +107,9 @@ fn frames(job: &Job, keeper: &Arc<dyn Keeper>, progress: &dyn Progress) -> Resul
                 job.depot.replicated(replicas)?.describe()
             )));
         }
-        (None, None) => prepared(job, replicas)?,
+        (None, None) => prepared_for_good(job, replicas)?,
     };
+    drop(looking);
     keeper.prepared(&reference, reused);
     let store = Arc::new(job.depot.replicated(replicas)?);
     let objects: Arc<dyn ObjectStore> = Arc::new(SceneObjects::new(store, job.runtime.clone())?);
@@ -136,6 +140,8 @@ fn frames(job: &Job, keeper: &Arc<dyn Keeper>, progress: &dyn Progress) -> Resul
             replicas,
             near: spec.placement != Placement::None,
             buckets: job.slots.iter().sum(),
+            exposure: spec.image.writes(PictureFile::Png).then(|| spec.image.exposure.unwrap_or(0.0)),
+            exr: spec.image.writes(PictureFile::Exr),
         };
         let (at, mut report) = render(job, keeper, progress, &scene, &stage, places, &sampling, (number, picture))?;
         // known to whoever prepared the scene
@@ -146,6 +152,31 @@ fn frames(job: &Job, keeper: &Arc<dyn Keeper>, progress: &dyn Progress) -> Resul
         keeper.done(number, &at, &report);
     }
     Ok(())
+}
+
+/// Times that a scene is prepared that is gone when it is looked for.
+const PREPARED_AGAIN: u32 = 3;
+
+/// As [`prepared`], and marks it as used. Where another operator deletes it meanwhile it is prepared once more.
+fn prepared_for_good(job: &Job, replicas: u32) -> Result<(ObjectRef, bool, u64), JobError> {
+    for _ in 0..PREPARED_AGAIN {
+        let made = prepared(job, replicas)?;
+        if used(job, replicas, &made.0.hash)?.is_some() {
+            return Ok(made);
+        }
+        tracing::warn!("scene {} went away as soon as it was found: it is prepared again", made.0.hash);
+    }
+    let place = job.depot.replicated(replicas)?.describe();
+    Err(JobError::Scene(format!("it is gone from {place} each time that it is prepared: see what else deletes there")))
+}
+
+/// Marks a scene as used, then looks whether it is there all the same.
+fn used(job: &Job, replicas: u32, hash: &ObjectHash) -> Result<Option<ObjectRef>, StoreError> {
+    if let Err(e) = job.runtime.block_on(scenes::mark(job.depot.stores(), hash, scenes::unix_now())) {
+        tracing::warn!("scene {hash} is not marked as used: {e}");
+    }
+    let size = job.runtime.block_on(job.depot.replicated(replicas)?.size(&object_key(hash)))?;
+    Ok(size.map(|bytes| ObjectRef { hash: *hash, bytes }))
 }
 
 /// Has the scene prepared by a worker, unless it is; its manifest, whether it was there, and cells of volumes that were not looked into.
@@ -168,9 +199,8 @@ fn prepared(job: &Job, replicas: u32) -> Result<(ObjectRef, bool, u64), JobError
 /// that is silent.
 fn known(job: &Job, replicas: u32) -> Result<Option<ObjectRef>, JobError> {
     let Some(hash) = job.known.as_deref().and_then(|h| h.parse().ok()) else { return Ok(None) };
-    let store = job.depot.replicated(replicas)?;
-    match job.runtime.block_on(store.size(&object_key(&hash))) {
-        Ok(size) => Ok(size.map(|bytes| ObjectRef { hash, bytes })),
+    match used(job, replicas, &hash) {
+        Ok(found) => Ok(found),
         Err(e @ StoreError::Unavailable { .. }) if job.spec.scene.prepared.is_none() => {
             tracing::warn!("{e}: the scene is prepared again");
             Ok(None)

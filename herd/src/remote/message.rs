@@ -102,6 +102,17 @@ pub struct Stage {
     /// Tiles of a band of the film.
     #[serde(default = "whole")]
     pub band: u32,
+    /// Exposure in stops of the PNG that is written beside the picture; without one there is none.
+    #[serde(default)]
+    pub exposure: Option<f64>,
+    /// Whether the EXR is kept.
+    #[serde(default = "yes")]
+    pub exr: bool,
+}
+
+/// Operators of versions that know no choice want the EXR.
+fn yes() -> bool {
+    true
 }
 
 /// Operators of versions without bands take films as a whole.

@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::io::BufWriter;
 use std::panic::{AssertUnwindSafe, catch_unwind};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
@@ -26,6 +26,7 @@ use crate::local::attempt::{self, Attempt, FilmUse, Shared};
 use crate::local::nodes::{Fetch, Nodes, Part};
 use crate::local::slots::StopFlag;
 use crate::local::usage::thread_cpu;
+use crate::png_file;
 use crate::report::{Bytes, Kind, Place};
 use crate::store::{BlockStore, Caching, Copies, SceneObjects, StoreError, object_key, promised_hash};
 use crate::task::{Stop, codec};
@@ -362,7 +363,7 @@ impl<'l> Station<'l> {
                 };
                 let adder = Adder { layout: stage.frame.layout(), band: stage.band, read: &read };
                 match picture {
-                    Some(key) => self.picture(&adder, shared, parts, *spp, key),
+                    Some(key) => self.picture(&adder, (stage, shared), parts, *spp, key),
                     None => self.merge(&adder, shared, name.as_deref(), (parts, *band), *spp),
                 }
             }
@@ -430,11 +431,11 @@ impl<'l> Station<'l> {
         Ok(merged(adder, film, sum.error_sum(spp), non_finite, Vec::new()))
     }
 
-    /// Makes a picture in a file of our own, then puts it on the stores that take it.
+    /// Makes a picture in a file of our own, and the PNG beside it, then puts those that are wanted on the stores that take them.
     fn picture(
         &self,
         adder: &Adder,
-        shared: &Shared,
+        (stage, shared): (&Stage, &Shared),
         parts: &[FilmRef],
         spp: u32,
         key: &str,
@@ -447,13 +448,30 @@ impl<'l> Station<'l> {
         let file = tempfile::NamedTempFile::new_in(&self.scratch).map_err(io)?;
         let definition = definition(&shared.scene.manifest, shared.frame, spp)?;
         let offset = shared.scene.manifest.offset;
-        let totals = adder.picture(parts, spp, offset, &definition, BufWriter::new(file.as_file()))?;
+        let shown = tempfile::NamedTempFile::new_in(&self.scratch).map_err(io)?;
+        let rows = |e| png_file::Rows::new(shown.reopen()?, shared.frame.size, e);
+        let mut rows = stage.exposure.map(rows).transpose().map_err(io)?;
+        let seen = |row: &[[f32; 3]]| rows.as_mut().map_or(Ok(()), |r| r.add(row)).map_err(io);
+        let totals = adder.picture(parts, spp, offset, &definition, BufWriter::new(file.as_file()), seen)?;
+        let beside =
+            rows.map(|r| r.finish().and_then(|()| png_file::check_end(shown.as_file())).map_err(io)).transpose()?;
+        let beside = beside.map(|()| (format!("{}.png", key.strip_suffix(".exr").unwrap_or(key)), shown.path()));
+        // the PNG first: where the EXR is, it stands beside it
+        let files: Vec<(String, &Path)> =
+            beside.into_iter().chain(stage.exr.then(|| (key.to_owned(), file.path()))).collect();
+        let main = files.last().map_or(key, |(key, _)| key);
         let mut at = Vec::new();
-        let mut error = None;
+        let mut error: Option<StoreError> = None;
         // on every store, so that each of them shows it
         for store in self.depot.stores() {
-            match self.runtime.block_on(store.put_file(key, file.path())) {
-                Ok(()) => at.push(format!("{}/{key}", store.describe())),
+            let put = async {
+                for (key, file) in &files {
+                    store.put_file(key, file).await?;
+                }
+                Ok(())
+            };
+            match self.runtime.block_on(put) {
+                Ok(()) => at.push(format!("{}/{main}", store.describe())),
                 Err(e) => {
                     tracing::warn!("{e}");
                     error = Some(e);

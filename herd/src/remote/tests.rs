@@ -7,7 +7,7 @@ use std::sync::atomic::{AtomicU32, Ordering};
 use std::sync::{Arc, LazyLock, Mutex};
 use std::time::{Duration, Instant};
 
-use rayherd_api::{Aov, RenderJobSpec, Strategy};
+use rayherd_api::{Aov, PictureFile, RenderJobSpec, Strategy};
 use rayherd_render::aov::Aovs;
 use rayherd_render::film::Layout;
 use rayherd_render::skip::Skip;
@@ -24,9 +24,9 @@ use super::{Depot, Fleet, Link, LinkError, Station, Turns};
 use crate::driver::{Event, Executor};
 use crate::job::{JobError, JobSettings, PreparedScene, Sampling, Silent, spec as from_spec};
 use crate::local::{journal, render_local};
-use crate::picture;
 use crate::report;
 use crate::store::{BlockStore, FaultPlan, Faulty, MemoryStore, Patience, SceneObjects, Watched, object_key};
+use crate::{picture, png_file, scenes};
 
 const EXAMPLE: &str = include_str!("../../../examples/cornell-box.xml");
 const SOURCE: &str = "scenes/cornell/box.xml";
@@ -136,8 +136,22 @@ fn expected(spec: &RenderJobSpec) -> Vec<u8> {
     local(spec).0
 }
 
+/// Texels of a PNG.
+fn texels(file: &[u8]) -> Vec<u8> {
+    let mut reader = png::Decoder::new(std::io::Cursor::new(file)).read_info().unwrap();
+    let mut texels = vec![0; reader.output_buffer_size().unwrap()];
+    reader.next_frame(&mut texels).unwrap();
+    texels
+}
+
 /// That file and the report of that run.
 fn local(spec: &RenderJobSpec) -> (Vec<u8>, report::Report) {
+    let (exr, _, report) = local_files(spec);
+    (exr, report)
+}
+
+/// Both files of a local run, and its report.
+fn local_files(spec: &RenderJobSpec) -> (Vec<u8>, Vec<u8>, report::Report) {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("box.xml");
     std::fs::write(&path, CORNELL.as_str()).unwrap();
@@ -153,7 +167,8 @@ fn local(spec: &RenderJobSpec) -> (Vec<u8>, report::Report) {
     let out = render_local(&scene, &frame, &sampling, &JobSettings::default(), &Silent).unwrap();
     let definition = from_spec::definition(&scene.manifest, &frame, out.spp).unwrap();
     let layers = out.film.channels(out.spp, scene.manifest.offset);
-    (picture::encode(&out.image, &layers, &definition).unwrap(), out.report)
+    let shown = png_file::encode(&out.image, spec.image.exposure.unwrap_or(0.0)).unwrap();
+    (picture::encode(&out.image, &layers, &definition).unwrap(), shown, out.report)
 }
 
 struct Cluster {
@@ -730,10 +745,20 @@ fn a_server_that_comes_back_without_its_bucket_costs_its_copies_and_no_byte() {
 
 #[test]
 fn a_job_whose_scene_is_known_needs_its_source_no_more() {
-    let spec = spec(Strategy::Auto, 4, 2);
+    let mut spec = spec(Strategy::Auto, 4, 2);
+    spec.image.exposure = Some(1.5);
     let (cluster, kept) = (Cluster::new(3), Arc::new(Kept::default()));
     cluster.render(&spec, &kept).unwrap();
+    // the PNG stands beside the picture, with its exposure
+    let (exr, png, _) = local_files(&spec);
+    assert!(cluster.picture(0) == exr);
+    let shown = || cluster.runtime.block_on(cluster.stores[1].get("out/a.png")).map(|png| texels(&png));
+    assert_eq!(shown().unwrap(), texels(&png));
     let scene = kept.prepared.lock().unwrap()[0].0.hash.to_string();
+    // every server knows that a job has used it
+    let marks = cluster.runtime.block_on(scenes::find(cluster.depot(None).stores())).unwrap();
+    let used = marks.all[&scene.parse().unwrap()].used.unwrap();
+    assert_eq!((marks.stores, scenes::unix_now() - used < 600), (3, true));
     cluster.runtime.block_on(cluster.stores[0].delete(&[SOURCE.to_owned(), TEXTURE.to_owned()])).unwrap();
     let again = |known: Option<String>| {
         let kept = Arc::new(Kept::default());
@@ -746,16 +771,30 @@ fn a_job_whose_scene_is_known_needs_its_source_no_more() {
     // another job that names it by its hash alone
     let mut named = spec.clone();
     (named.scene.source, named.scene.prepared, named.splits) = (String::new(), Some(scene.clone()), None);
-    let by_name = |known: &str| {
-        let (kept, known) = (Arc::new(Kept::default()), Some(known.to_owned()));
-        let done = cluster.beside((&named, &kept, "g"), |job| Job { known, prefix: "jobs/3".into(), ..job }, |_, _| {});
-        (done, kept)
-    };
     cluster.runtime.block_on(cluster.stores[0].delete(&["out/a.exr".to_owned()])).unwrap();
-    let (done, kept) = by_name(&scene);
-    done.unwrap();
+    let (kept, known) = (Arc::new(Kept::default()), Some(scene.clone()));
+    cluster.beside((&named, &kept, "g"), |job| Job { known, prefix: "jobs/3".into(), ..job }, |_, _| {}).unwrap();
     assert!(kept.prepared.lock().unwrap()[0].1, "nothing was prepared");
     assert!(cluster.picture(0) == expected(&spec));
+    // one file alone, of a job that is finished: nothing but that is done
+    let rendered = kept.reports.lock().unwrap()[0].tasks;
+    for (files, there, address) in
+        [(PictureFile::Exr, (true, false), "out/a.exr"), (PictureFile::Png, (false, true), "out/a.png")]
+    {
+        cluster.runtime.block_on(cluster.stores[1].delete(&["out/a.exr".into(), "out/a.png".into()])).unwrap();
+        named.image.files = Some(vec![files]);
+        let known = Some(scene.clone());
+        let session = address.rsplit_once('.').unwrap().1;
+        cluster
+            .beside((&named, &kept, session), |job| Job { known, prefix: "jobs/3".into(), ..job }, |_, _| {})
+            .unwrap();
+        let exr = cluster.runtime.block_on(cluster.stores[1].get("out/a.exr"));
+        assert_eq!((exr.is_ok(), shown().is_ok()), there);
+        let last = kept.reports.lock().unwrap().last().unwrap().clone();
+        assert_eq!((last.tasks, last.tasks_reused), (0, rendered));
+        assert!(kept.pictures.lock().unwrap().last().unwrap().iter().all(|at| at.ends_with(address)));
+    }
+    assert_eq!(shown().unwrap(), texels(&png));
     let absent = "0".repeat(64);
     named.scene.prepared = Some(absent.clone());
     let by_name = cluster.beside(

@@ -183,6 +183,8 @@ fn what_a_worker_has_cached_makes_it_a_holder_and_is_read_from_s3_no_more() {
             near,
             buckets: 2,
             band: BAND,
+            exposure: None,
+            exr: true,
         };
         let holders = || -> Vec<Vec<u32>> { fleet.holders().unwrap().into_iter().take(4).collect() };
         // a worker tells what it holds when it asks for more, which is after its result
@@ -246,6 +248,8 @@ fn of_what_a_cache_holds_the_latest_word_counts() {
             near: true,
             buckets: 1,
             band: BAND,
+            exposure: None,
+            exr: true,
         };
         fleet.open(stage, vec![vec![0]; 4], 0);
     };
