@@ -63,6 +63,8 @@ pub struct State {
     pub first_task: Option<Timestamp>,
     /// The scene's manifest, when it is prepared.
     pub scene: Option<String>,
+    /// It is cut, and its blocks are being built: by all workers.
+    pub cut: bool,
     /// It was prepared before.
     pub reused: bool,
     /// Its manifest was known from the job's status: workers of an earlier run may be there.

@@ -413,15 +413,15 @@ async fn keep_pods(
     for kill in killed {
         running.fleet.killed_for_memory(kill.number, kill.limit.as_deref());
     }
-    let (held, prepared, waits) = {
+    let (held, placed, waits) = {
         let state = running.lock();
         // a known scene is looked up at once: workers of an earlier run must not go for that moment
         let fresh = state.started.is_some_and(|t| Timestamp::now().duration_since(t) < LOOK_UP);
-        (state.held.clone(), state.scene.is_some(), state.known && fresh)
+        (state.held.clone(), state.cut || state.scene.is_some(), state.known && fresh)
     };
-    // until it is known where the scene's blocks are, one worker prepares it
-    let wanted = if prepared { follow(job, running) } else { 1 };
-    let mut plan = if waits && !prepared {
+    // until it is known where the scene's blocks are, or are to be, one worker prepares it
+    let wanted = if placed { follow(job, running) } else { 1 };
+    let mut plan = if waits && !placed {
         build::Plan::default()
     } else {
         build::plan(&job.name_any(), &found, wanted, (&held, job.spec.placement))

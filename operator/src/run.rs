@@ -12,6 +12,7 @@ use rayherd_herd::job::spec::scene_settings;
 use rayherd_herd::job::{JobError, Progress, Status};
 use rayherd_herd::remote::bands::BAND;
 use rayherd_herd::remote::frames::{Job, Keeper, run};
+use rayherd_herd::remote::preparing::APART;
 use rayherd_herd::remote::{Depot, Fleet, Storage, Turns};
 use rayherd_herd::report::Report;
 use rayherd_scene::objects::ObjectRef;
@@ -112,6 +113,7 @@ pub fn start(
             turns: &turns,
             slots,
             band: BAND,
+            apart: APART,
             runtime,
         };
         let keeper: Arc<dyn Keeper> = Arc::new(keeper);
@@ -156,6 +158,10 @@ impl Keeper for Kept {
     fn prepared(&self, scene: &ObjectRef, reused: bool) {
         let mut state = self.running.lock();
         (state.scene, state.reused) = (Some(scene.hash.to_string()), reused);
+    }
+    fn cut(&self, bytes: &[u64]) {
+        self.placed(bytes);
+        self.running.lock().cut = true;
     }
     fn below(&self, what: Option<&str>) {
         self.running.lock().below = what.map(str::to_owned);

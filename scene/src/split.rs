@@ -7,7 +7,7 @@ use crate::prepare::Cut;
 /// Geometry bytes per primitive of a good mesh: 40 in a leaf, a 224-byte node for every 18 or so (measured by the kernel's
 /// prototype: 52.0 to 52.3 at 1 M and 8 M triangles). Where primitives of all sizes cross each other, leaves hold fewer and it is up
 /// to 90: see [`windows`].
-const MESH_BYTES: u64 = 53;
+pub(crate) const MESH_BYTES: u64 = 53;
 /// Ids of a copied split have gaps and take 8 bytes each; those of a split in source order are a few runs.
 const COPIED_ID_BYTES: u64 = 8;
 /// Header and root node of a block.

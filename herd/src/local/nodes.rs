@@ -23,7 +23,7 @@ use crate::wire::WireError;
 /// Nodes that get a copy of each split: a function of the scene and their number, so that all who ask agree.
 pub fn placement(scene: &PreparedScene, nodes: u32, replicas: u32) -> Vec<Vec<u32>> {
     let order = scene.owning_order();
-    let sizes: Vec<u64> = order.iter().map(|&s| scene.split_bytes(s)).collect();
+    let sizes: Vec<u64> = order.iter().map(|&s| scene.manifest.splits[s as usize].weight()).collect();
     // what nobody ever reads lies on the first nodes
     let mut holders = vec![(0..replicas).collect::<Vec<u32>>(); scene.splits() as usize];
     for (&split, on) in order.iter().zip(place::holders(&sizes, nodes, replicas)) {

@@ -59,6 +59,10 @@ pub struct Deaths {
 pub fn keys(work: &Work) -> Vec<String> {
     match work {
         Work::Prepare { .. } => vec!["preparing the scene".into()],
+        Work::Build { splits, .. } => {
+            let first = splits.first().map_or(0, |s| s.number);
+            vec![format!("building {} blocks of the scene, from split {first} on", splits.len())]
+        }
         Work::Attempt { attempt } => {
             let units = attempt.camera.iter().map(|u| format!("camera rays of tile {} from {}", u.tile, u.first));
             attempt.groups.iter().map(|g| format!("rays {}", g.key)).chain(units).collect()

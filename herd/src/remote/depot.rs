@@ -8,7 +8,8 @@ use bytes::Bytes;
 
 use crate::job::JobError;
 use crate::local::nodes::disk_key;
-use crate::store::{BlockStore, NodeView, Prefixed, Replicated, StoreError, Watched};
+use crate::report::Stage;
+use crate::store::{BlockStore, Counters, NodeView, Prefixed, Replicated, StoreError, Verify, Watched};
 
 /// All stores, numbered; one of them may be on this machine.
 #[derive(Clone)]
@@ -83,9 +84,19 @@ impl Depot {
 
     /// All stores as one, with so many copies of each object.
     pub fn replicated(&self, copies: u32) -> Result<NodeView, StoreError> {
+        self.view(copies, None, None)
+    }
+
+    /// The same; bodies may be checked against their keys, and what is moved counted.
+    pub fn view(
+        &self,
+        copies: u32,
+        verify: Option<Verify>,
+        counters: Option<(Counters, Stage)>,
+    ) -> Result<NodeView, StoreError> {
         let copies = copies.clamp(1, self.len()) as usize;
-        let all = Arc::new(Replicated::new(self.stores.clone(), copies, None)?);
-        Ok(all.view(self.home.map(|h| h as usize), None))
+        let all = Arc::new(Replicated::new(self.stores.clone(), copies, verify)?);
+        Ok(all.view(self.home.map(|h| h as usize), counters))
     }
 
     /// What lies below a prefix: `nodes/N/KEY` is `KEY` on store N alone, every other key has so many copies.

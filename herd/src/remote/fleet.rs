@@ -376,8 +376,7 @@ impl Fleet {
         worker.open |= in_stage;
         worker.bands = poll.bands;
         worker.told(poll.holds.as_ref());
-        let can = |work: &Work| poll.bands || !matches!(work, Work::Merge { band: Some(_), .. });
-        let first = state.common.iter().position(|(_, work)| can(work));
+        let first = state.common_for(poll);
         let (what, work) = if let Some((call, work)) = first.and_then(|at| state.common.remove(at)) {
             (What::Call { call, work: work.clone() }, work)
         } else if !poll.clerk
@@ -472,8 +471,7 @@ impl Fleet {
     /// # Errors
     /// When it cannot be done.
     pub fn call(&self, work: Work) -> Result<Done, JobError> {
-        let done = self.ask(work, false)?;
-        done.ok_or_else(|| JobError::Internal("work was given up that was to be waited for".into()))
+        self.call_all(vec![work])?.pop().ok_or_else(given_up)
     }
 
     /// Has workers do several things, in whatever order, and waits for all; what came out, in theirs.
@@ -481,6 +479,26 @@ impl Fleet {
     /// # Errors
     /// When one of them cannot be done; then the rest is given up.
     pub fn call_all(&self, works: Vec<Work>) -> Result<Vec<Done>, JobError> {
+        self.ask(works, false)?.into_iter().map(|done| done.ok_or_else(given_up)).collect()
+    }
+
+    /// As [`Fleet::call`], as long as a worker is there: none when all are gone, and nobody does it.
+    ///
+    /// # Errors
+    /// When it cannot be done.
+    pub fn call_while_staffed(&self, work: Work) -> Result<Option<Done>, JobError> {
+        self.ask(vec![work], true)?.pop().ok_or_else(given_up)
+    }
+
+    /// As [`Fleet::call_all`], as long as a worker is there: none for what nobody was left to do.
+    ///
+    /// # Errors
+    /// When one of them cannot be done; then the rest is given up.
+    pub fn call_all_while_staffed(&self, works: Vec<Work>) -> Result<Vec<Option<Done>>, JobError> {
+        self.ask(works, true)
+    }
+
+    fn ask(&self, works: Vec<Work>, while_staffed: bool) -> Result<Vec<Option<Done>>, JobError> {
         let mut state = self.lock();
         let first = state.next;
         let calls = first..first + works.len() as u64;
@@ -491,13 +509,18 @@ impl Fleet {
         for call in calls.clone() {
             let result = loop {
                 if let Some(result) = state.answers.remove(&call) {
-                    break result.map_err(Failure::into_error);
+                    break result.map(Some).map_err(Failure::into_error);
                 }
                 if let Err(e) = state.check() {
                     break Err(e);
                 }
                 if state.sweep() {
                     self.wanted.notify_waiters();
+                }
+                if while_staffed && !state.is_staffed() {
+                    // what a worker had in hand that is gone is back among the common work
+                    state.common.retain(|(c, _)| *c != call);
+                    break Ok(None);
                 }
                 state = self.wait(state, Duration::from_millis(200));
             };
@@ -513,37 +536,6 @@ impl Fleet {
             }
         }
         Ok(done)
-    }
-
-    /// As [`Fleet::call`], as long as a worker is there: none when all are gone, and nobody does it.
-    ///
-    /// # Errors
-    /// When it cannot be done.
-    pub fn call_while_staffed(&self, work: Work) -> Result<Option<Done>, JobError> {
-        self.ask(work, true)
-    }
-
-    fn ask(&self, work: Work, while_staffed: bool) -> Result<Option<Done>, JobError> {
-        let mut state = self.lock();
-        let call = state.next;
-        state.next += 1;
-        state.common.push_back((call, work));
-        self.wanted.notify_waiters();
-        loop {
-            if let Some(result) = state.answers.remove(&call) {
-                return result.map(Some).map_err(Failure::into_error);
-            }
-            state.check()?;
-            if state.sweep() {
-                self.wanted.notify_waiters();
-            }
-            if while_staffed && !state.is_staffed() {
-                // what a worker had in hand that is gone is back among the common work
-                state.common.retain(|(c, _)| *c != call);
-                return Ok(None);
-            }
-            state = self.wait(state, Duration::from_millis(200));
-        }
     }
 
     /// Waits until a worker is there.
@@ -585,6 +577,15 @@ impl Fleet {
 const GIVE_MORE: &str = "raise resources.limits.memory of the container worker in spec.workers.template (without it a pod gets \
      spec.workers.memory and 256Mi, and 256Mi more for each slot), or have fewer spec.workers.slots or a smaller spec.blockSize";
 
+/// Whether a home is one of these stores.
+fn is_beside(stores: &[u32], home: Option<u32>) -> bool {
+    home.is_some_and(|home| stores.contains(&home))
+}
+
+fn given_up() -> JobError {
+    JobError::Internal("work was given up that was to be waited for".into())
+}
+
 /// Memory that was halved so often, but holds the largest split.
 fn halved(memory: Option<u64>, level: u32, least: u64) -> Option<u64> {
     memory.map(|m| (m >> level).max(least.min(m)))
@@ -617,6 +618,35 @@ impl State {
             .collect();
         ready.into_iter().for_each(|(task, number, ..)| self.lose(task, number));
         self.emptied.clear();
+    }
+
+    /// Whether a worker is there beside one of these stores.
+    fn has_beside(&self, stores: &[u32]) -> bool {
+        self.workers.iter().flatten().any(|w| is_beside(stores, w.home))
+    }
+
+    /// Which of the common work a worker is given: the first that it can do. Blocks are built in whatever order: those that are to lie on the store
+    /// beside it come first.
+    fn common_for(&self, poll: &Poll) -> Option<usize> {
+        let can = |work: &Work| match work {
+            Work::Merge { band: Some(_), .. } => poll.bands,
+            // slots alone, so that as many trees are in memory as there are slots
+            Work::Build { .. } => poll.builds && !poll.clerk,
+            Work::Prepare { beside, .. } => is_beside(beside, poll.home) || !self.has_beside(beside),
+            _ => true,
+        };
+        let is_near = |work: &Work| match work {
+            Work::Build { splits, .. } => {
+                poll.home.is_some() && splits.first().is_some_and(|s| s.on.first().copied() == poll.home)
+            }
+            _ => false,
+        };
+        let mut all = (0..).zip(&self.common).filter(|(_, (_, work))| can(work));
+        let (first, (_, work)) = all.next()?;
+        if !matches!(work, Work::Build { .. }) || is_near(work) {
+            return Some(first);
+        }
+        Some(all.find(|(_, (_, work))| is_near(work)).map_or(first, |(at, _)| at))
     }
 
     /// Notes that a worker is there; whether it was not before.

@@ -12,8 +12,9 @@ use tokio::runtime::Handle;
 use super::bands;
 use super::guard::Guard;
 use super::homes::Homes;
-use super::message::{Done, Stage, Work};
+use super::message::Stage;
 use super::parts::Parts;
+use super::preparing::prepared;
 use super::{Depot, Fleet, Turns};
 use crate::driver::{Driver, Pointer, Start};
 use crate::job::{JobError, JobSettings, NodeSpec, PreparedScene, Progress, Sampling, spec as from_spec};
@@ -40,6 +41,10 @@ pub trait Keeper: Send + Sync {
     /// # Errors
     /// [`JobError::Owned`] when somebody else moved it.
     fn move_to(&self, frame: u32, sequence: u64, name: &str) -> Result<(), JobError>;
+    /// The scene is cut, and its blocks are to be built by as many workers as there can be: bytes by store.
+    fn cut(&self, bytes: &[u64]) {
+        self.placed(bytes);
+    }
     /// The scene is prepared.
     fn prepared(&self, scene: &ObjectRef, reused: bool);
     /// Which nodes' stores hold the scene: bytes by store.
@@ -74,6 +79,8 @@ pub struct Job<'a> {
     pub slots: Vec<u32>,
     /// Tiles of a band of a film without AOVs ([`super::bands`]).
     pub band: u32,
+    /// Primitives of a scene from which on its blocks are built by all workers ([`super::preparing`]).
+    pub apart: u64,
     /// Where input and output runs; not the caller's thread.
     pub runtime: Handle,
 }
@@ -107,7 +114,7 @@ fn frames(job: &Job, keeper: &Arc<dyn Keeper>, progress: &dyn Progress) -> Resul
                 job.depot.replicated(replicas)?.describe()
             )));
         }
-        (None, None) => prepared_for_good(job, replicas)?,
+        (None, None) => prepared_for_good(job, keeper.as_ref(), replicas)?,
     };
     drop(looking);
     keeper.prepared(&reference, reused);
@@ -158,9 +165,9 @@ fn frames(job: &Job, keeper: &Arc<dyn Keeper>, progress: &dyn Progress) -> Resul
 const PREPARED_AGAIN: u32 = 3;
 
 /// As [`prepared`], and marks it as used. Where another operator deletes it meanwhile it is prepared once more.
-fn prepared_for_good(job: &Job, replicas: u32) -> Result<(ObjectRef, bool, u64), JobError> {
+fn prepared_for_good(job: &Job, keeper: &dyn Keeper, replicas: u32) -> Result<(ObjectRef, bool, u64), JobError> {
     for _ in 0..PREPARED_AGAIN {
-        let made = prepared(job, replicas)?;
+        let made = prepared(job, keeper, replicas)?;
         if used(job, replicas, &made.0.hash)?.is_some() {
             return Ok(made);
         }
@@ -177,22 +184,6 @@ fn used(job: &Job, replicas: u32, hash: &ObjectHash) -> Result<Option<ObjectRef>
     }
     let size = job.runtime.block_on(job.depot.replicated(replicas)?.size(&object_key(hash)))?;
     Ok(size.map(|bytes| ObjectRef { hash: *hash, bytes }))
-}
-
-/// Has the scene prepared by a worker, unless it is; its manifest, whether it was there, and cells of volumes that were not looked into.
-fn prepared(job: &Job, replicas: u32) -> Result<(ObjectRef, bool, u64), JobError> {
-    let prepare = Work::Prepare { spec: Box::new(job.spec.clone()), replicas };
-    loop {
-        // whose turn it is must have who does it: jobs that wait with their workers may leave no room for its own
-        job.fleet.staffed()?;
-        // of two jobs that come at once with one scene, the second finds it prepared
-        let _turn = job.turns.take(&job.spec.scene.source, || job.fleet.check())?;
-        match job.fleet.call_while_staffed(prepare.clone())? {
-            Some(Done::Prepared { scene, reused, cells_passed }) => return Ok((scene, reused, cells_passed)),
-            Some(_) => return Err(JobError::Internal("a worker reports something else than it was to do".into())),
-            None => tracing::warn!("the worker that was to prepare the scene is gone: others come first"),
-        }
-    }
 }
 
 /// The manifest that is known by its hash, if it is there still. A job that goes on needs its source no more, which may lie on a store

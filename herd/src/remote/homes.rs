@@ -3,9 +3,11 @@
 //! A job that is to have W workers prepares its scene so that the first copy of every block lies on W stores, its homes: as many workers
 //! beside them read nothing from afar. The store beside the worker that prepares is one of them, which stays where it is. They stand in the
 //! manifest ([`Manifest::homes`]), so that all who read find the blocks, whatever the number of their workers; a scene without them has its
-//! blocks on all stores.
+//! blocks on all stores. Blocks are dealt by what is known of them before they are built ([`SplitEntry::weight`]): so whoever builds one puts
+//! it where it belongs at once.
 //!
 //! [`Manifest::homes`]: rayherd_scene::manifest::Manifest::homes
+//! [`SplitEntry::weight`]: rayherd_scene::manifest::SplitEntry::weight
 
 use crate::job::PreparedScene;
 use crate::local::nodes::placement;
@@ -32,7 +34,7 @@ impl Homes {
         let ranked = ranked(scene, stores, homes);
         let homes = homes.len() as u32;
         let order = scene.owning_order();
-        let sizes: Vec<u64> = order.iter().map(|&s| scene.split_bytes(s)).collect();
+        let sizes: Vec<u64> = order.iter().map(|&s| scene.manifest.splits[s as usize].weight()).collect();
         // what nobody ever reads lies anywhere
         let mut splits = vec![(0..replicas).collect::<Vec<u32>>(); scene.splits() as usize];
         for (&split, on) in order.iter().zip(place::gathered(&sizes, &ranked, homes, replicas)) {

@@ -40,6 +40,9 @@ pub struct Poll {
     /// It makes the layers that a frame asks for; workers of earlier versions leave them out, and say nothing.
     #[serde(default)]
     pub aovs: bool,
+    /// It builds blocks of scenes that others cut.
+    #[serde(default)]
+    pub builds: bool,
     /// What its cache holds of the stage's scene, if it has one.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub holds: Option<Holds>,
@@ -130,6 +133,21 @@ pub enum Work {
         spec: Box<RenderJobSpec>,
         /// Copies of each block.
         replicas: u32,
+        /// The blocks of a large scene are built by others; whoever prepares builds them without it, or knowing nothing of it.
+        #[serde(default, skip_serializing_if = "Option::is_none")]
+        apart: Option<Apart>,
+        /// Stores that hold the source: better a worker beside one of them than one that is beside none.
+        #[serde(default, skip_serializing_if = "Vec::is_empty")]
+        beside: Vec<u32>,
+    },
+    /// Build blocks of a scene that is cut, and put them where they belong.
+    Build {
+        /// Below this their primitives lie.
+        prefix: String,
+        /// Which.
+        splits: Vec<ToBuild>,
+        /// Copies of each block.
+        replicas: u32,
     },
     /// Trace.
     Attempt {
@@ -162,6 +180,30 @@ pub enum Work {
         /// The store that is silent.
         gone: u32,
     },
+}
+
+/// Where what lies between cutting a scene and building its blocks is put.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "camelCase")]
+pub struct Apart {
+    /// Prefix of its keys, without a slash at its end.
+    pub prefix: String,
+    /// Scenes of fewer primitives are built by whoever cuts them.
+    pub least: u64,
+}
+
+/// A block to build.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "camelCase")]
+pub struct ToBuild {
+    /// Number of its split.
+    pub number: u32,
+    /// Primitives in it.
+    pub primitives: u64,
+    /// Its primitives, packed and sealed.
+    pub packed: ObjectRef,
+    /// Stores that it belongs on, its home first.
+    pub on: Vec<u32>,
 }
 
 /// What a worker did.
@@ -217,6 +259,18 @@ pub enum Done {
         /// Cells of volumes that were not looked into.
         #[serde(default)]
         cells_passed: u64,
+    },
+    /// Of preparing a large scene: blocks are to be built.
+    Drafted {
+        /// The manifest as it will be, with packed primitives in place of blocks.
+        draft: ObjectRef,
+        /// Cells of volumes that were not looked into.
+        cells_passed: u64,
+    },
+    /// Of building blocks.
+    Built {
+        /// They, in the order that they were asked for.
+        blocks: Vec<ObjectRef>,
     },
     /// Of an attempt.
     Made {

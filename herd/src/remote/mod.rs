@@ -5,6 +5,7 @@
 //! loop over rounds ([`crate::driver`]), fed by workers that come and go. How messages travel is not known here.
 
 pub mod bands;
+mod blocks;
 mod deaths;
 pub mod depot;
 pub mod fleet;
@@ -12,14 +13,17 @@ pub mod frames;
 mod guard;
 mod holdings;
 mod homes;
+mod listing;
 pub mod message;
 mod parts;
 mod prepare;
+pub mod preparing;
 pub mod profile;
 pub mod station;
 pub mod storage;
 #[cfg(test)]
 mod tests;
+mod traffic;
 pub mod turns;
 
 pub use depot::Depot;

@@ -5,27 +5,29 @@ use std::io::BufWriter;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError, RwLock};
 use std::time::{Duration, Instant};
 
 use rayherd_render::film::ErrorSum;
 use rayherd_scene::manifest::Manifest;
 use rayherd_scene::objects::{ObjectRef, ObjectStore};
-use tokio::runtime::Runtime;
+use tokio::runtime::{Handle, Runtime};
 
 use super::Depot;
 use super::bands::Adder;
+use super::blocks::{build_blocks, is_large};
 use super::holdings::Holdings;
 use super::homes::Homes;
 use super::message::{Answer, Beat, Done, Failure, Holds, Poll, Reads, Report, Stage, Work, WorkerId};
 use super::prepare::prepare_scene;
+use super::traffic::Traffic;
 use crate::job::spec::definition;
 use crate::job::{JobError, JobSettings, NodeSpec, PreparedScene};
 use crate::ledger::FilmRef;
 use crate::local::attempt::{self, Attempt, FilmUse, Shared};
 use crate::local::nodes::{Fetch, Nodes, Part};
 use crate::local::slots::StopFlag;
-use crate::local::usage::thread_cpu;
+use crate::local::usage::{process_cpu, thread_cpu};
 use crate::png_file;
 use crate::report::{Bytes, Kind, Place};
 use crate::store::{BlockStore, Caching, Copies, SceneObjects, StoreError, object_key, promised_hash};
@@ -69,6 +71,9 @@ pub struct Station<'l> {
     copies: Option<Arc<Copies>>,
     runtime: Runtime,
     running: Mutex<BTreeMap<String, StopFlag>>,
+    /// Held by one piece of work that takes all threads, or by several that build small blocks.
+    threads: RwLock<()>,
+    traffic: Traffic,
     leaving: AtomicBool,
     panicked: AtomicBool,
     /// Pieces of work in a row that did not come out for now.
@@ -106,7 +111,22 @@ impl<'l> Station<'l> {
         let failures = AtomicU32::new(0);
         let slots = slots.max(1);
         let copies = None;
-        Ok(Station { link, depot, slots, worker, scratch, copies, runtime, running, leaving, panicked, failures })
+        let (threads, traffic) = (RwLock::default(), Traffic::default());
+        Ok(Station {
+            link,
+            depot,
+            slots,
+            worker,
+            scratch,
+            copies,
+            runtime,
+            running,
+            threads,
+            traffic,
+            leaving,
+            panicked,
+            failures,
+        })
     }
 
     /// The same; what is read of scenes from other machines is kept in a cache, and the operator told of it.
@@ -267,6 +287,7 @@ impl<'l> Station<'l> {
                 clerk,
                 bands: true,
                 aovs: true,
+                builds: true,
                 holds: open.and_then(Opened::holds),
             };
             match self.link.poll(&poll) {
@@ -289,10 +310,16 @@ impl<'l> Station<'l> {
         if self.is_leaving() {
             stop.set();
         }
-        let before = thread_cpu();
+        let alone = self.takes_all_threads(work);
+        let all_threads = alone.then(|| self.threads.write().unwrap_or_else(PoisonError::into_inner));
+        let beside = !alone && matches!(work, Work::Build { .. });
+        let some_threads = beside.then(|| self.threads.read().unwrap_or_else(PoisonError::into_inner));
+        let clock = if alone { process_cpu } else { thread_cpu };
+        let before = clock();
         let result = catch_unwind(AssertUnwindSafe(|| self.done(work, open, &stop)))
             .unwrap_or_else(|_| Err(JobError::Internal("a task panicked".into())));
-        let cpu = thread_cpu() - before;
+        let cpu = clock() - before;
+        drop((all_threads, some_threads));
         let result = result.map_err(|e| {
             let no_bucket = if matches!(e, JobError::Stopped) { None } else { self.depot.without_bucket() };
             let e = no_bucket.map_or(e, JobError::from);
@@ -303,7 +330,9 @@ impl<'l> Station<'l> {
             failure
         });
         let rest = self.rest(&result);
-        let bytes = open.map_or_else(Bytes::default, |o| o.shared.nodes.take_bytes()).rows();
+        let mut bytes = open.map_or_else(Bytes::default, |o| o.shared.nodes.take_bytes());
+        bytes.merge(&self.traffic.take());
+        let bytes = bytes.rows();
         let (splits, tiles) = open.map(|o| o.shared.nodes.take_reads()).unwrap_or_default();
         let reads = Reads { stage: open.map(|o| o.stage.id.clone()).unwrap_or_default(), splits, tiles };
         let cache_failures = self.copies.as_ref().map_or(0, |c| c.take_failures());
@@ -344,10 +373,13 @@ impl<'l> Station<'l> {
         let not_open = || JobError::Internal("work of a stage that is not open".into());
         let open = || open.map(|o| (o.stage, &o.shared)).ok_or_else(not_open);
         match work {
-            Work::Prepare { spec, replicas } => {
-                let (scene, reused, cells_passed) =
-                    prepare_scene(&self.depot, self.runtime.handle(), spec, *replicas, &self.scratch)?;
-                Ok(Done::Prepared { scene, reused, cells_passed })
+            Work::Prepare { spec, replicas, apart, .. } => {
+                prepare_scene(self.place(), spec, *replicas, apart.as_ref(), &self.scratch)
+            }
+            Work::Build { prefix, splits, replicas } => {
+                let alone = self.takes_all_threads(work);
+                let blocks = build_blocks(self.place(), prefix, splits, *replicas, alone, stop)?;
+                Ok(Done::Built { blocks })
             }
             Work::Attempt { attempt } => {
                 let (_, shared) = open()?;
@@ -402,6 +434,20 @@ impl<'l> Station<'l> {
             few += u64::from(!enough);
         }
         Ok(Done::Restored { copies, few })
+    }
+
+    /// Where preparing works.
+    fn place(&self) -> (&Depot, &Handle, &Traffic) {
+        (&self.depot, self.runtime.handle(), &self.traffic)
+    }
+
+    /// Whether work is done by all threads of the process together, and nothing beside it.
+    fn takes_all_threads(&self, work: &Work) -> bool {
+        match work {
+            Work::Prepare { .. } => true,
+            Work::Build { splits, .. } => is_large(splits, self.slots),
+            _ => false,
+        }
     }
 
     /// Our place among the stores; one past them when none is here.

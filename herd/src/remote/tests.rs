@@ -1,5 +1,6 @@
 //! Whole jobs over stores in memory: operator and workers in this process, the messages as they would go over the wire.
 
+mod apart;
 mod cached;
 
 use std::collections::{BTreeMap, BTreeSet};
@@ -20,6 +21,7 @@ use tokio::runtime::{Handle, Runtime};
 use super::bands::{self, BAND};
 use super::frames::{Job, Keeper, run};
 use super::message::{Answer, Beat, Poll, Report, WorkerId};
+use super::preparing::APART;
 use super::{Depot, Fleet, Link, LinkError, Station, Turns};
 use crate::driver::{Event, Executor};
 use crate::job::{JobError, JobSettings, PreparedScene, Sampling, Silent, spec as from_spec};
@@ -178,6 +180,8 @@ struct Cluster {
     turns: Turns,
     /// Tiles of a band, of four that the film has, without AOVs: with all of them it takes 11 for 3.
     band: u32,
+    /// Primitives from which on all workers build a scene.
+    apart: u64,
 }
 
 impl Cluster {
@@ -185,8 +189,8 @@ impl Cluster {
         let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build().unwrap();
         let memory = || Arc::new(Faulty::new(Arc::new(MemoryStore::default()), FaultPlan::default()));
         let stores = (0..nodes).map(|_| memory()).collect();
-        let cluster =
-            Cluster { stores, runtime, scratch: tempfile::tempdir().unwrap(), turns: Turns::default(), band: BAND };
+        let (scratch, turns) = (tempfile::tempdir().unwrap(), Turns::default());
+        let cluster = Cluster { stores, runtime, scratch, turns, band: BAND, apart: APART };
         cluster.runtime.block_on(cluster.stores[0].put(SOURCE, CORNELL.clone().into())).unwrap();
         cluster.runtime.block_on(cluster.stores[0].put(TEXTURE, wall().into())).unwrap();
         cluster
@@ -207,6 +211,7 @@ impl Cluster {
             turns: &self.turns,
             slots: vec![1; 3],
             band: self.band,
+            apart: self.apart,
             runtime: self.runtime.handle().clone(),
         }
     }
@@ -218,6 +223,14 @@ impl Cluster {
     }
     fn wire<'a>(&self, fleet: &'a Fleet) -> Wire<'a> {
         Wire { fleet, runtime: self.runtime.handle().clone(), polls: AtomicU32::new(0), attempts: AtomicU32::new(0) }
+    }
+    /// No source is known by its listing any more: workers are asked.
+    fn forget_sources(&self) {
+        for store in &self.stores {
+            let names = self.runtime.block_on(store.list("names/source-")).unwrap();
+            let names: Vec<String> = names.into_iter().map(|(key, _)| key).collect();
+            self.runtime.block_on(store.delete(&names)).unwrap();
+        }
     }
     fn picture(&self, store: usize) -> Vec<u8> {
         self.runtime.block_on(self.stores[store].get("out/a.exr")).unwrap().to_vec()
@@ -342,8 +355,16 @@ fn a_job_without_workers_keeps_no_other_from_preparing_their_scene() {
         let waits = scope.spawn(move || run(&cluster.job(spec, depot, first, "f"), &keeper, &Silent));
         // nor one whose worker was there, and is gone with the work in its hands
         let gone = WorkerId { number: 0, session: "gone".into() };
-        let poll =
-            Poll { worker: gone.clone(), home: None, stage: None, clerk: false, bands: true, aovs: true, holds: None };
+        let poll = Poll {
+            worker: gone.clone(),
+            home: None,
+            stage: None,
+            clerk: false,
+            bands: true,
+            aovs: true,
+            builds: true,
+            holds: None,
+        };
         wait_for(|| matches!(first.answer(&poll), Ok(Answer::Work { .. })));
         first.gone(&gone);
         cluster.render(spec, &kept).unwrap();
@@ -493,6 +514,7 @@ fn a_worker_that_comes_back_under_another_session_loses_only_its_tasks() {
         clerk: false,
         bands: true,
         aovs: true,
+        builds: true,
         holds: None,
     };
     assert_eq!(fleet.answer(&poll("a")), Ok(Answer::Wait));
@@ -564,6 +586,7 @@ fn a_worker_that_knows_no_bands_is_given_none() {
             clerk: false,
             bands,
             aovs: true,
+            builds: true,
             holds: None,
         })
         .unwrap();
@@ -811,7 +834,8 @@ fn workers_that_wait_are_sent_to_the_next_fleet_at_once() {
     let runtime = Runtime::new().unwrap();
     let fleet = Fleet::new(1, "e");
     let worker = WorkerId { number: 0, session: "a".into() };
-    let poll = Poll { worker, home: None, stage: None, clerk: false, bands: true, aovs: true, holds: None };
+    let poll =
+        Poll { worker, home: None, stage: None, clerk: false, bands: true, aovs: true, builds: true, holds: None };
     // far longer than a test may take
     let waits = runtime.block_on(async {
         let waiting = fleet.poll(&poll, Duration::from_secs(3600));
@@ -834,8 +858,16 @@ impl Hand<'_> {
         let since = Instant::now();
         loop {
             let worker = WorkerId { number: 0, session: session.into() };
-            let poll =
-                Poll { worker, home: None, stage: stage.clone(), clerk: false, bands: true, aovs: true, holds: None };
+            let poll = Poll {
+                worker,
+                home: None,
+                stage: stage.clone(),
+                clerk: false,
+                bands: true,
+                aovs: true,
+                builds: true,
+                holds: None,
+            };
             match self.0.answer(&poll).unwrap() {
                 Answer::Open { stage: now } => (memory, stage) = now.map_or((None, None), |s| (s.memory, Some(s.id))),
                 Answer::Work { work, .. } => return (memory, *work),
@@ -932,6 +964,7 @@ fn work_that_kills_its_worker_each_time_fails_the_job() {
     assert!(said.contains("preparing the scene: 3 workers were killed") && said.contains("may take 1Gi"), "{said}");
     // whatever they die of
     cluster.render(&spec, &kept).unwrap();
+    cluster.forget_sources();
     let scene = kept.prepared.lock().unwrap()[0].0.hash.to_string();
     for known in [None, Some(scene)] {
         let what = if known.is_some() { "camera rays of tile" } else { "preparing the scene" };

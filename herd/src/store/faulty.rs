@@ -8,7 +8,7 @@ use std::time::Duration;
 use async_trait::async_trait;
 use bytes::Bytes;
 
-use super::{BlockStore, Pulse, StoreError};
+use super::{BlockStore, Pulse, StoreError, Version};
 
 /// What goes wrong and how often: shares of 1000 operations.
 ///
@@ -278,6 +278,11 @@ impl BlockStore for Faulty {
     async fn list(&self, prefix: &str) -> Result<Vec<(String, u64)>, StoreError> {
         self.begin("list", prefix).await?;
         self.inner().list(prefix).await
+    }
+
+    async fn list_versions(&self, prefix: &str) -> Result<Option<Vec<Version>>, StoreError> {
+        self.begin("list", prefix).await?;
+        self.inner().list_versions(prefix).await
     }
 
     async fn delete(&self, keys: &[String]) -> Result<(), StoreError> {

@@ -6,7 +6,7 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 use async_trait::async_trait;
 use bytes::Bytes;
 
-use super::{BlockStore, StoreError, check_key, check_prefix};
+use super::{BlockStore, StoreError, Version, check_key, check_prefix};
 
 /// Objects in this process's memory, up to a limit.
 pub struct MemoryStore {
@@ -83,6 +83,17 @@ impl BlockStore for MemoryStore {
         let objects = self.lock();
         let from = objects.by_key.range(prefix.to_owned()..);
         Ok(from.take_while(|(k, _)| k.starts_with(prefix)).map(|(k, b)| (k.clone(), b.len() as u64)).collect())
+    }
+
+    async fn list_versions(&self, prefix: &str) -> Result<Option<Vec<Version>>, StoreError> {
+        check_prefix(prefix)?;
+        let objects = self.lock();
+        let from = objects.by_key.range(prefix.to_owned()..).take_while(|(k, _)| k.starts_with(prefix));
+        let version = |(key, body): (&String, &Bytes)| {
+            let tag = blake3::hash(body).to_hex().to_string();
+            Version { key: key.clone(), bytes: body.len() as u64, tag, put: None }
+        };
+        Ok(Some(from.map(version).collect()))
     }
 
     async fn delete(&self, keys: &[String]) -> Result<(), StoreError> {

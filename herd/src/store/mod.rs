@@ -70,10 +70,28 @@ pub trait BlockStore: Send + Sync {
     async fn size(&self, key: &str) -> Result<Option<u64>, StoreError>;
     /// Keys that begin with the prefix (any string prefix, not only whole segments), ascending by bytes, with sizes.
     async fn list(&self, prefix: &str) -> Result<Vec<(String, u64)>, StoreError>;
+    /// The same with what tells contents apart; `None` where the store cannot say that of all of them.
+    async fn list_versions(&self, _prefix: &str) -> Result<Option<Vec<Version>>, StoreError> {
+        Ok(None)
+    }
     /// Deletes objects; those that are not there are no error.
     async fn delete(&self, keys: &[String]) -> Result<(), StoreError>;
     /// Where this is, for messages: `s3://bucket/prefix`, a folder, `memory`.
     fn describe(&self) -> String;
+}
+
+/// An object as it is now.
+#[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub struct Version {
+    /// Its key.
+    pub key: String,
+    /// Its size.
+    pub bytes: u64,
+    /// Another one for another content. The same content may have several (S3: an ETag is the MD5 of what was put in one piece, and made of
+    /// the MD5s of its parts otherwise).
+    pub tag: String,
+    /// When it was put, seconds, if the store knows: tells the same content that was put again.
+    pub put: Option<i64>,
 }
 
 fn unreadable(store: String, file: &Path, e: &std::io::Error) -> StoreError {

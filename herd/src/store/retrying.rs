@@ -10,7 +10,7 @@ use async_trait::async_trait;
 use bytes::Bytes;
 use futures::future::BoxFuture;
 
-use super::{BlockStore, StoreError};
+use super::{BlockStore, StoreError, Version};
 
 /// How often and how fast to try again.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -106,6 +106,10 @@ impl BlockStore for Retrying {
 
     async fn list(&self, prefix: &str) -> Result<Vec<(String, u64)>, StoreError> {
         self.retry(|| self.inner.list(prefix)).await
+    }
+
+    async fn list_versions(&self, prefix: &str) -> Result<Option<Vec<Version>>, StoreError> {
+        self.retry(|| self.inner.list_versions(prefix)).await
     }
 
     async fn delete(&self, keys: &[String]) -> Result<(), StoreError> {

@@ -29,7 +29,7 @@ use bytes::{Bytes, BytesMut};
 use md5::{Digest, Md5};
 use tokio::io::AsyncWriteExt;
 
-use super::{BlockStore, StoreError, check_key, check_prefix};
+use super::{BlockStore, StoreError, Version, check_key, check_prefix};
 pub use identity::{Identity, S3Credentials, S3Key};
 use multipart::Parts;
 
@@ -291,6 +291,38 @@ impl S3Store {
         }
     }
 
+    /// Key, size, ETag and time of what begins with a prefix, ascending by key.
+    async fn listed(&self, prefix: &str) -> Result<Vec<Listed>, StoreError> {
+        check_prefix(prefix)?;
+        let mut found = Vec::new();
+        let mut from: Option<String> = None;
+        loop {
+            let request = self.client.list_objects_v2().bucket(&self.bucket).prefix(self.path(prefix));
+            let request = request.set_continuation_token(from.clone()).send();
+            let page = request.await.map_err(|e| self.failure("list", prefix, 0, e))?;
+            for object in page.contents() {
+                let key = object.key().and_then(|k| k.strip_prefix(&self.prefix));
+                // what others put into the bucket under names that we do not use is not ours
+                let Some(key) = key.filter(|k| check_key(k).is_ok()) else { continue };
+                let bytes = object.size().and_then(|n| u64::try_from(n).ok()).unwrap_or(0);
+                let tag = object.e_tag().map(|t| t.trim_matches('"').to_owned()).filter(|t| !t.is_empty());
+                found.push((key.to_owned(), bytes, tag, object.last_modified().map(|t| t.secs())));
+            }
+            if page.is_truncated() != Some(true) {
+                break;
+            }
+            let next = page.next_continuation_token().map(str::to_owned);
+            if next.is_none() || next == from {
+                return Err(self.broken("list", prefix, "a page names no next one"));
+            }
+            from = next;
+        }
+        // S3 sorts by bytes; not every server does
+        found.sort_unstable();
+        found.dedup();
+        Ok(found)
+    }
+
     async fn delete_batch(&self, keys: &[String]) -> Result<(), StoreError> {
         let first = &keys[0];
         let unbuildable = |e: aws_sdk_s3::error::BuildError| self.broken("delete", first, e.to_string());
@@ -412,32 +444,12 @@ impl BlockStore for S3Store {
     }
 
     async fn list(&self, prefix: &str) -> Result<Vec<(String, u64)>, StoreError> {
-        check_prefix(prefix)?;
-        let mut found = Vec::new();
-        let mut from: Option<String> = None;
-        loop {
-            let request = self.client.list_objects_v2().bucket(&self.bucket).prefix(self.path(prefix));
-            let request = request.set_continuation_token(from.clone()).send();
-            let page = request.await.map_err(|e| self.failure("list", prefix, 0, e))?;
-            for object in page.contents() {
-                let key = object.key().and_then(|k| k.strip_prefix(&self.prefix));
-                // what others put into the bucket under names that we do not use is not ours
-                let Some(key) = key.filter(|k| check_key(k).is_ok()) else { continue };
-                found.push((key.to_owned(), object.size().and_then(|n| u64::try_from(n).ok()).unwrap_or(0)));
-            }
-            if page.is_truncated() != Some(true) {
-                break;
-            }
-            let next = page.next_continuation_token().map(str::to_owned);
-            if next.is_none() || next == from {
-                return Err(self.broken("list", prefix, "a page names no next one"));
-            }
-            from = next;
-        }
-        // S3 sorts by bytes; not every server does
-        found.sort_unstable();
-        found.dedup();
-        Ok(found)
+        Ok(self.listed(prefix).await?.into_iter().map(|(key, bytes, ..)| (key, bytes)).collect())
+    }
+
+    async fn list_versions(&self, prefix: &str) -> Result<Option<Vec<Version>>, StoreError> {
+        let all = self.listed(prefix).await?.into_iter();
+        Ok(all.map(|(key, bytes, tag, put)| Some(Version { key, bytes, tag: tag?, put })).collect())
     }
 
     async fn delete(&self, keys: &[String]) -> Result<(), StoreError> {
@@ -452,6 +464,9 @@ impl BlockStore for S3Store {
         self.name.clone()
     }
 }
+
+/// Key, size, ETag, time of the last put.
+type Listed = (String, u64, Option<String>, Option<i64>);
 
 /// Settings for a put of so many bytes: its answer comes after the whole body, which takes its time on a slow line.
 fn patient(bytes: u64) -> aws_sdk_s3::config::Builder {

@@ -388,7 +388,12 @@ impl S3 for Buckets {
             .iter()
             .filter(|(key, _)| key.starts_with(&prefix) && **key > after)
             .take(most + 1)
-            .map(|(key, body)| Object { key: Some(key.clone()), size: Some(body.len() as i64), ..Default::default() })
+            .map(|(key, body)| Object {
+                key: Some(key.clone()),
+                size: Some(body.len() as i64),
+                e_tag: Some(tag(body)),
+                ..Default::default()
+            })
             .collect();
         let truncated = found.len() > most;
         found.truncate(most);

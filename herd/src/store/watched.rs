@@ -16,7 +16,7 @@ use bytes::Bytes;
 use tokio::net::TcpStream;
 use tokio::time::{Instant, timeout};
 
-use super::{BlockStore, StoreError};
+use super::{BlockStore, StoreError, Version};
 
 /// Whether a machine answers at all, however busy its server is.
 #[async_trait]
@@ -234,6 +234,10 @@ impl BlockStore for Watched {
     }
     async fn list(&self, prefix: &str) -> Result<Vec<(String, u64)>, StoreError> {
         Ok(self.ask("list", prefix, self.inner.list(prefix)).await?.unwrap_or_default())
+    }
+    async fn list_versions(&self, prefix: &str) -> Result<Option<Vec<Version>>, StoreError> {
+        // one that has lost what it held says nothing of it
+        Ok(self.ask("list", prefix, self.inner.list_versions(prefix)).await?.flatten())
     }
     async fn delete(&self, keys: &[String]) -> Result<(), StoreError> {
         // what is gone with the bucket need not be deleted

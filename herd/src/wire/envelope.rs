@@ -29,6 +29,8 @@ pub enum Kind {
     FilmPart = 2,
     /// What a round consumed and made.
     RoundRecord = 3,
+    /// A split's primitives between the worker that cut the scene and the one that builds its block.
+    Primitives = 4,
 }
 
 /// Whether [`seal`] tries to make a payload smaller.

@@ -16,6 +16,7 @@ pub use crate::grid::{Candidate, StoppedBy};
 use crate::grid::{Grid, GridData};
 use crate::objects::{ObjectError, ObjectHash, ObjectKind, ObjectRef, ObjectStore};
 use crate::prepare::PrepareSettings;
+use crate::split::MESH_BYTES;
 
 /// Version of the manifest and of everything it names. A change of any layout, of recentring, of the order of records
 /// or of the grid's rules changes it; scenes of other versions are prepared again.
@@ -83,6 +84,13 @@ pub struct SplitEntry {
     pub last_id: PrimId,
     /// Made by overlap reduction: every primitive in it is in another split as well.
     pub copied: bool,
+}
+
+impl SplitEntry {
+    /// Bytes that it takes, but for how good its tree is: known before that is built, so that its place can be.
+    pub fn weight(&self) -> u64 {
+        (self.triangles + self.spheres) * MESH_BYTES + self.attributes.bytes
+    }
 }
 
 /// How the grid was chosen, and what overlap reduction did.

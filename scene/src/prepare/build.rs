@@ -13,10 +13,20 @@ use super::records::{ATTRIBUTES, NORMALS, Records, UVS};
 use crate::grid::count::box_of;
 use crate::grid::lattice::{round_down, round_up};
 use crate::manifest::SplitEntry;
-use crate::objects::{ObjectKind, ObjectStore};
+use crate::objects::{ObjectError, ObjectKind, ObjectRef, ObjectStore};
+
+/// Takes a split's primitives, packed, in place of its block, which others build of them.
+pub type Keep<'a> = dyn Fn(&[u8]) -> Result<ObjectRef, ObjectError> + Sync + 'a;
+
+/// Where the objects of splits go.
+pub(super) struct Blocks<'a> {
+    pub store: &'a CountingStore<'a>,
+    /// Who takes the primitives, if blocks are not built here.
+    pub keep: Option<&'a Keep<'a>>,
+}
 
 /// Lends rayon's threads to the tree builder.
-struct Rayon;
+pub(super) struct Rayon;
 
 impl Fork for Rayon {
     fn join(&self, a: &mut (dyn FnMut() + Send), b: &mut (dyn FnMut() + Send)) {
@@ -31,26 +41,30 @@ pub(crate) struct Built {
     pub tree: Duration,
 }
 
-/// Geometry object of a split.
-pub(crate) fn block(number: u32, records: &Records) -> Result<Vec<u8>, PrepareError> {
+/// Geometry object of a split. `number` is for messages.
+pub(super) fn block(number: u32, records: &Records, fork: &dyn Fork) -> Result<Vec<u8>, PrepareError> {
     let spheres: Vec<_> = records.spheres.iter().map(|s| s.sphere()).collect();
-    build_block(&records.triangles, &records.triangle_ids, &spheres, &records.sphere_ids, &Rayon)
+    build_block(&records.triangles, &records.triangle_ids, &spheres, &records.sphere_ids, fork)
         .map_err(|source| PrepareError::Build { split: number, source })
 }
 
-/// Builds and stores a split of at least one primitive. `number` is for messages.
-pub(crate) fn build_split(
+/// Builds and stores a split of at least one primitive; or keeps what its block is to be built of, which the entry names then.
+pub(super) fn build_split(
     number: u32,
     records: &Records,
     copied: bool,
-    store: &CountingStore,
+    blocks: &Blocks,
 ) -> Result<Built, PrepareError> {
     let started = Clock::start();
-    let block = block(number, records)?;
-    let tree = started.elapsed();
-    let geometry = store.put(ObjectKind::Geometry, &block)?;
-    drop(block);
-    let attributes = store.put(ObjectKind::Attributes, &attributes(records).encode())?;
+    let (geometry, tree) = match blocks.keep {
+        Some(keep) => (keep(&records.pack())?, Duration::ZERO),
+        None => {
+            let block = block(number, records, &Rayon)?;
+            let tree = started.elapsed();
+            (blocks.store.put(ObjectKind::Geometry, &block)?, tree)
+        }
+    };
+    let attributes = blocks.store.put(ObjectKind::Attributes, &attributes(records).encode())?;
 
     let mut bounds = CellBox::EMPTY;
     bounds.add(&CellBox::from(box_of(records.triangles.as_flattened())));

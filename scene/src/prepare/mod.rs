@@ -14,8 +14,10 @@
 //! depend on threads.
 
 mod build;
+mod building;
 mod clock;
 mod counting;
+mod draft;
 mod fingerprint;
 mod incidence;
 mod ingest;
@@ -28,6 +30,7 @@ mod spool;
 #[cfg(test)]
 mod tests;
 mod textures;
+mod world;
 
 use std::io;
 use std::ops::Range;
@@ -36,28 +39,29 @@ use std::time::Duration;
 
 use rayherd_render::bvh::BuildError;
 use rayherd_render::skip::Skip;
-use rayherd_render::texture::Texture;
-use rayherd_render::world::{Beam, Environment, ShapeInfo, Slide, Sun, World};
 use rayon::prelude::*;
 
 use crate::ImportError;
-use crate::description::{self, Description, Place};
+use crate::description::{Description, Place};
 use crate::grid::count::{Counter, Primitives, candidates, choose};
 use crate::grid::{CellData, GridData, Lattice};
 use crate::import;
-use crate::manifest::{Counts, Defaults, FORMAT, GridChoice, Manifest, ManifestError, SplitEntry};
-use crate::objects::{ObjectError, ObjectHash, ObjectKind, ObjectRef, ObjectStore};
+use crate::manifest::{Counts, Defaults, FORMAT, GridChoice, Manifest, ManifestError};
+use crate::objects::{ObjectError, ObjectKind, ObjectRef, ObjectStore};
 use crate::overlap;
 use crate::record::RecordSource;
 use crate::split::{Capacity, bytes_each, cut, windows};
 
-use build::build_split;
+use build::{Blocks, Rayon};
+use building::Building;
 use counting::CountingStore;
-use incidence::{CellBox, ChosenCells, Incidence, incidence};
+use incidence::{CellBox, ChosenCells};
 use ingest::Ingested;
 use spool::Spool;
-use textures::Shining;
 
+pub use build::Keep;
+pub use building::AT_ONCE;
+pub use draft::{Apart, Outcome, build, complete, draft, packed_most};
 pub use fingerprint::{fingerprint, source_files};
 pub use progress::{NoProgress, PrepareProgress, Stage};
 pub use report::{ByteKind, ByteOp, ByteRow, PrepareReport};
@@ -160,6 +164,21 @@ pub fn prepare(
     store: &dyn ObjectStore,
     progress: &dyn PrepareProgress,
 ) -> Result<Prepared, PrepareError> {
+    match passes(description, source, settings, spool, (store, None), progress)? {
+        Outcome::Prepared(prepared) => Ok(*prepared),
+        Outcome::Draft(_) => Err(PrepareError::Inconsistent("a draft that nobody asked for".to_owned())),
+    }
+}
+
+/// All passes; with `apart` those of a large scene end before its blocks are built.
+fn passes(
+    description: &Description,
+    source: &dyn RecordSource,
+    settings: &PrepareSettings,
+    spool: &SpoolSettings,
+    (store, apart): (&dyn ObjectStore, Option<&Apart>),
+    progress: &dyn PrepareProgress,
+) -> Result<Outcome, PrepareError> {
     settings.check().map_err(PrepareError::Settings)?;
     let print = fingerprint(description)?;
     let found = if spool.skips.makes(Skip::Prepared) { Manifest::find(store, &print, settings) } else { Ok(None) };
@@ -168,12 +187,12 @@ pub fn prepare(
             let report = PrepareReport::reused(reference.bytes);
             let defaults = Defaults::of(description);
             if manifest.defaults == defaults {
-                return Ok(Prepared { manifest, reference, reused: true, report });
+                return Ok(Prepared { manifest, reference, reused: true, report }.into());
             }
             // the same scene for another picture: a new list of the same objects
             let manifest = Manifest { defaults, ..manifest };
             let reference = manifest.store(store)?;
-            return Ok(Prepared { manifest, reference, reused: true, report });
+            return Ok(Prepared { manifest, reference, reused: true, report }.into());
         }
         Ok(None) => {}
         Err(ManifestError::Store(error)) => return Err(error.into()),
@@ -184,16 +203,16 @@ pub fn prepare(
 
     // 1, 2
     let (offset, mut ingested) = read(description, source, spool, progress)?;
-    let textures = textures::store(&description.textures, shining(description, &mut ingested), &store)?;
+    let textures = textures::store(&description.textures, world::shining(description, &mut ingested), &store)?;
     ingested.counts.source_bytes += textures.bytes_read;
     let tiles = textures.tiles;
-    let world = world(description, &offset, &mut ingested, textures.textures)?;
+    let world = world::world(description, &offset, &mut ingested, textures.textures)?;
     let world_bytes = serde_json::to_vec(&world).map_err(|e| PrepareError::Inconsistent(e.to_string()))?;
     let sky_map = match import::sky_map(description.environment.as_ref())? {
         Some(map) => Some(store.put(ObjectKind::Texture, &map.encode())?),
         None => None,
     };
-    let content = content_hash(&offset, &ingested.hash, &world_bytes, sky_map.as_ref(), &tiles);
+    let content = world::content_hash(&offset, &ingested.hash, &world_bytes, sky_map.as_ref(), &tiles);
     let inner = ingested.inner();
     let Ingested { spool, counts, lo, hi, .. } = ingested;
     let spool_error = |source| PrepareError::Spool { folder: spool.folder().clone(), source };
@@ -205,6 +224,7 @@ pub fn prepare(
     if ranges.len() >= 1 << 22 {
         return Err(PrepareError::TooManySplits(ranges.len() as u64));
     }
+    let keep = apart.filter(|a| ranges.len() > 1 && primitives >= a.least).map(|a| a.keep);
     let (cells, mut choice) =
         choose_grid(&spool, &ranges, (inner, lo, hi), capacity, settings, progress).map_err(spool_error)?;
 
@@ -216,7 +236,7 @@ pub fn prepare(
         .overlap_reduction
         .then(|| overlap::group(&cells.lattice, &cells.indices, &cells.primitives, &copied, capacity.copied));
     let mut building = Building {
-        store: &store,
+        blocks: Blocks { store: &store, keep },
         cells: &cells,
         groups: groups.as_ref(),
         spool,
@@ -234,9 +254,8 @@ pub fn prepare(
     // 5
     building.reduce(capacity.copied, progress)?;
     let Building { splits, boxes, owners, spool, tree, .. } = building;
-    let of_copies = || splits.iter().filter(|s| s.copied);
-    choice.copies = of_copies().map(|s| s.triangles + s.spheres).sum();
-    choice.rewritten_bytes = of_copies().map(|s| s.geometry.bytes + s.attributes.bytes).sum();
+    choice.copies = splits.iter().filter(|s| s.copied).map(|s| s.triangles + s.spheres).sum();
+    choice.rewritten_bytes = draft::rewritten(&splits);
 
     let world = store.put(ObjectKind::Manifest, &world_bytes)?;
     let grid = grid_data(&cells, &boxes, owners, (inner, lo, hi));
@@ -260,9 +279,12 @@ pub fn prepare(
         counts,
         homes: None,
     };
+    if keep.is_some() {
+        return Ok(Outcome::Draft(Box::new(manifest)));
+    }
     let reference = manifest.store(&store)?;
     let report = PrepareReport::new(&manifest, &store, spool.traffic(), tree);
-    Ok(Prepared { manifest, reference, reused: false, report })
+    Ok(Prepared { manifest, reference, reused: false, report }.into())
 }
 
 /// Reads the source: at most twice, the importer's own reading for bounds included.
@@ -294,121 +316,12 @@ fn read(
     Ok((offset, ingested))
 }
 
-fn world(
-    description: &Description,
-    offset: &[f64; 3],
-    ingested: &mut Ingested,
-    textures: Vec<Texture>,
-) -> Result<World, PrepareError> {
-    let materials = description.materials.len();
-    if let Some(shape) = description.shapes.iter().find(|s| s.material as usize >= materials) {
-        let message = format!("shape {:?} has material {} of {materials}", shape.name, shape.material);
-        return Err(PrepareError::Inconsistent(message));
-    }
-    let shapes = description.shapes.iter().map(|s| ShapeInfo {
-        name: s.name.clone(),
-        material: s.material,
-        emission: s.emission,
-        emission_texture: s.emission_texture,
-    });
-    let world = World {
-        materials: description.materials.clone(),
-        textures,
-        shapes: shapes.collect(),
-        emissive: std::mem::take(&mut ingested.emissive),
-        glows: std::mem::take(&mut ingested.glows),
-        beams: description.beams.iter().map(|b| beam(b, offset)).collect(),
-        environment: description.environment.as_ref().map(|sky| match sky {
-            description::Environment::Constant(radiance) => Environment::Constant(*radiance),
-            description::Environment::Map { scale, to_world, .. } => {
-                Environment::Map { scale: *scale, to_map: import::to_map(to_world), upper: false }
-            }
-            description::Environment::Sky(sky) => Environment::Map {
-                scale: sky.scale,
-                to_map: import::to_map(&sky.to_world.after(&import::PICTURE_TO_SKY)),
-                upper: true,
-            },
-        }),
-        sun: description.sun.as_ref().map(|sun| Sun {
-            direction: sun.direction.map(|x| x as f32),
-            up: sun.up.map(|x| x as f32),
-            // as 2 sin^2 of the half: small angles keep their digits
-            cap: (2.0 * libm::sin(0.5 * sun.half_angle) * libm::sin(0.5 * sun.half_angle)) as f32,
-            radiance: sun.radiance,
-        }),
-        lo: ingested.lo,
-        hi: ingested.hi,
-    };
-    world.check().map_err(PrepareError::Inconsistent)?;
-    Ok(world)
-}
-
-/// By texture: the primitives whose emission it gives, to be weighed.
-fn shining<'a>(description: &Description, ingested: &'a mut Ingested) -> Shining<'a> {
-    let mut out = Shining::new();
-    let mut emissive = ingested.emissive.iter();
-    for glow in &mut ingested.glows {
-        // both by ascending id
-        let Some(e) = emissive.find(|e| e.prim == glow.prim) else { break };
-        if let Some(texture) = description.shapes[e.shape as usize].emission_texture {
-            out.entry(texture).or_default().push((glow, e.geometry));
-        }
-    }
-    out
-}
-
-/// A beam in recentred f32.
-fn beam(beam: &description::Beam, offset: &[f64; 3]) -> Beam {
-    let place = |p: &[f64; 3]| std::array::from_fn(|i| (p[i] - offset[i]) as f32);
-    match beam {
-        description::Beam::Point { position, intensity } => {
-            Beam::Point { position: place(position), intensity: *intensity }
-        }
-        description::Beam::Spot { position, axis, intensity, beam, cutoff, slide } => Beam::Spot {
-            position: place(position),
-            axis: axis.map(|x| x as f32),
-            intensity: *intensity,
-            beam: beam.to_radians() as f32,
-            cutoff: cutoff.to_radians() as f32,
-            slide: slide.as_ref().map(|slide| Slide {
-                texture: slide.texture,
-                to_local: slide.to_local.map(|row| row.map(|x| x as f32)),
-                tan: libm::tan(cutoff.to_radians()) as f32,
-            }),
-        },
-        description::Beam::Directional { direction, irradiance } => {
-            Beam::Directional { direction: direction.map(|x| x as f32), irradiance: *irradiance }
-        }
-    }
-}
-
-fn content_hash(
-    offset: &[f64; 3],
-    records: &blake3::Hash,
-    world: &[u8],
-    sky_map: Option<&ObjectRef>,
-    tiles: &[ObjectRef],
-) -> ObjectHash {
-    let mut hasher = blake3::Hasher::new();
-    hasher.update(b"rayherd content\0").update(&FORMAT.to_le_bytes());
-    for x in offset {
-        hasher.update(&x.to_le_bytes());
-    }
-    hasher.update(records.as_bytes());
-    // the world says how many there are, and whether there is a picture of the sky
-    for object in sky_map.into_iter().chain(tiles) {
-        hasher.update(&object.hash.0);
-    }
-    hasher.update(world);
-    ObjectHash(*hasher.finalize().as_bytes())
-}
-
 /// Builds a few small blocks to see what a primitive takes: (bytes, primitives) of each.
 fn sample(spool: &Spool, cut: Cut, primitives: u64) -> Result<Vec<(u64, u64)>, PrepareError> {
     let build = |range: &Range<u64>| {
         let records =
             spool.range(range).map_err(|source| PrepareError::Spool { folder: spool.folder().clone(), source })?;
-        Ok((build::block(0, &records)?.len() as u64, records.len() as u64))
+        Ok((build::block(0, &records, &Rayon)?.len() as u64, records.len() as u64))
     };
     windows(cut, primitives).iter().map(build).collect()
 }
@@ -468,76 +381,4 @@ fn grid_data(
         }
     }
     out
-}
-
-/// Primitives in all splits that are built at one time: some 300 MiB of records, trees and blocks. A larger split is built alone, by all
-/// threads together.
-const AT_ONCE: u64 = 1 << 20;
-
-/// How many splits of at most so many primitives are built at one time: each holds its records and its tree.
-fn at_once(primitives: u64) -> usize {
-    usize::try_from(AT_ONCE / primitives.max(1)).unwrap_or(usize::MAX).clamp(1, rayon::current_num_threads())
-}
-
-/// Splits on their way into the store.
-struct Building<'a> {
-    store: &'a CountingStore<'a>,
-    cells: &'a ChosenCells,
-    groups: Option<&'a overlap::Groups>,
-    spool: Spool,
-    splits: Vec<SplitEntry>,
-    /// What is in a cell, by its number.
-    boxes: Vec<CellBox>,
-    /// Who owns a cell, by its number.
-    owners: Vec<Vec<u32>>,
-    /// Chunks of the spool that hold a group's primitives, by ascending split.
-    parts: Vec<Vec<usize>>,
-    contested: u64,
-    tree: Duration,
-}
-
-impl Building<'_> {
-    fn spool_error(&self, source: io::Error) -> PrepareError {
-        PrepareError::Spool { folder: self.spool.folder().clone(), source }
-    }
-
-    fn source_splits(&mut self, ranges: &[Range<u64>], progress: &dyn PrepareProgress) -> Result<(), PrepareError> {
-        progress.begin(Stage::Building, Some(ranges.len() as u64));
-        let of_cell = self.groups.map_or(&[][..], |g| &g.of_cell);
-        for wave in ranges.chunks(at_once(ranges.iter().map(|r| r.end - r.start).max().unwrap_or(0))) {
-            let first = self.splits.len() as u32;
-            let work = |(split, range): (u32, &Range<u64>)| -> Result<_, PrepareError> {
-                let records = self.spool.range(range).map_err(|e| self.spool_error(e))?;
-                let found = incidence(self.cells, of_cell, &records);
-                let dealt = records.deal(&found.triangles, &found.spheres);
-                Ok((build_split(split, &records, false, self.store)?, found, dealt))
-            };
-            let numbered: Vec<(u32, &Range<u64>)> = (first..).zip(wave).collect();
-            // in order, so that the first error is always the same one
-            let done: Vec<_> = numbered.into_par_iter().map(work).collect();
-            for result in done {
-                let (built, found, dealt) = result?;
-                let split = self.splits.len() as u32;
-                self.splits.push(built.entry);
-                self.tree += built.tree;
-                self.note(split, &found);
-                for (group, records) in dealt {
-                    let chunk = self.spool.push(records).map_err(|e| self.spool_error(e))?;
-                    self.parts[group as usize].push(chunk);
-                }
-            }
-            progress.advance(wave.len() as u64);
-        }
-        Ok(())
-    }
-
-    /// Adds what a source split has in the cells.
-    fn note(&mut self, split: u32, found: &Incidence) {
-        self.contested += found.contested;
-        for (number, part) in &found.cells {
-            let n = *number as usize;
-            self.boxes[n].add(part);
-            self.owners[n].push(split);
-        }
-    }
 }

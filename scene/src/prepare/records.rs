@@ -248,6 +248,35 @@ impl Records {
         out.extend_from_slice(bytemuck::cast_slice(&self.spheres));
     }
 
+    /// What a block is built of: ids and shapes of the primitives, without what is only shading. Bytes as in [`Records::write`].
+    pub(crate) fn pack(&self) -> Vec<u8> {
+        let mut out = Vec::with_capacity(packed_bytes(self.triangles.len() as u64, self.spheres.len() as u64) as usize);
+        for count in [self.triangles.len(), self.spheres.len()] {
+            out.extend_from_slice(&(count as u64).to_ne_bytes());
+        }
+        out.extend_from_slice(bytemuck::cast_slice(&self.triangle_ids));
+        out.extend_from_slice(bytemuck::cast_slice(&self.triangles));
+        out.extend_from_slice(bytemuck::cast_slice(&self.sphere_ids));
+        out.extend_from_slice(bytemuck::cast_slice(&self.spheres));
+        out
+    }
+
+    /// What [`Records::pack`] packed, on a machine of the same byte order; `None` when the bytes are something else.
+    pub(crate) fn unpack(bytes: &[u8]) -> Option<Records> {
+        let (triangles, rest) = bytes.split_first_chunk::<8>()?;
+        let (spheres, mut rest) = rest.split_first_chunk::<8>()?;
+        let triangles = usize::try_from(u64::from_ne_bytes(*triangles)).ok()?;
+        let spheres = usize::try_from(u64::from_ne_bytes(*spheres)).ok()?;
+        let records = Records {
+            triangle_ids: take(&mut rest, triangles)?,
+            triangles: take(&mut rest, triangles)?,
+            sphere_ids: take(&mut rest, spheres)?,
+            spheres: take(&mut rest, spheres)?,
+            ..Records::default()
+        };
+        rest.is_empty().then_some(records)
+    }
+
     /// What [`Records::write`] wrote; `None` when the bytes are something else.
     pub(crate) fn read(bytes: &[u8]) -> Option<Records> {
         let mut rest = bytes;
@@ -270,6 +299,11 @@ impl Records {
         };
         rest.is_empty().then_some(records)
     }
+}
+
+/// Bytes of so many primitives, packed.
+pub(crate) fn packed_bytes(triangles: u64, spheres: u64) -> u64 {
+    16 + triangles * (8 + 36) + spheres * (8 + 24)
 }
 
 fn take<T: Pod>(rest: &mut &[u8], count: usize) -> Option<Vec<T>> {
@@ -329,6 +363,11 @@ mod tests {
             prop_assert_eq!(bytes.len() as u64, x.bytes());
             prop_assert_eq!(Records::read(&bytes), Some(x.clone()));
             prop_assert_eq!(Records::read(&bytes[..bytes.len() - 1]), None);
+            let packed = x.pack();
+            prop_assert_eq!(packed.len() as u64, packed_bytes(x.triangles.len() as u64, x.spheres.len() as u64));
+            let bare = Records { extras: vec![], normals: vec![], uvs: vec![], attributes: vec![], ..x.clone() };
+            prop_assert_eq!(Records::unpack(&packed), Some(bare));
+            prop_assert_eq!(Records::unpack(&packed[..packed.len() - 1]), None);
             prop_assert_eq!(x.id_range(), a.first().copied().zip(a.last().copied()));
             // triangles with even ids to 0, all to 1; spheres to 1
             let pairs: Vec<(u32, u32)> = (0u32..).zip(&x.triangle_ids)

@@ -2,10 +2,12 @@
 
 use rayon::prelude::*;
 
+use super::PrepareError;
+use super::build::build_split;
+use super::building::{Building, at_once};
 use super::incidence::ABSENT;
 use super::progress::{PrepareProgress, Stage};
 use super::records::Records;
-use super::{Building, PrepareError, at_once, build_split};
 
 impl Building<'_> {
     /// Joins groups in their order while their distinct primitives are at most `capacity`, builds the splits and hands the
@@ -48,9 +50,9 @@ impl Building<'_> {
     fn copied_splits(&mut self, full: &mut Vec<Records>) -> Result<(), PrepareError> {
         let first = self.splits.len() as u32;
         let numbered: Vec<(u32, Records)> = (first..).zip(full.drain(..)).collect();
-        let store = self.store;
+        let blocks = &self.blocks;
         let done: Vec<_> =
-            numbered.into_par_iter().map(|(split, records)| build_split(split, &records, true, store)).collect();
+            numbered.into_par_iter().map(|(split, records)| build_split(split, &records, true, blocks)).collect();
         for built in done {
             let built = built?;
             self.splits.push(built.entry);

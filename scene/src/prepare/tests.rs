@@ -4,13 +4,15 @@ use std::sync::atomic::{AtomicU32, Ordering};
 use rayherd_render::attributes::AttributeBlock;
 use rayherd_render::bvh::{Forest, Kernel, Tracer};
 use rayherd_render::ray::{Hit, Ray};
+use rayherd_render::world::World;
 use rayherd_tests::mutation::Random;
 
 use super::*;
 use crate::description::{Affine, Bsdf, Geometry, Material, Place, Shape};
 use crate::grid::touch::{sphere_cells, triangle_cells};
 use crate::grid::{Progress, SplitSet};
-use crate::objects::{DirectoryObjects, MemoryObjects};
+use crate::manifest::SplitEntry;
+use crate::objects::{DirectoryObjects, MemoryObjects, ObjectHash};
 use crate::record::{Record, RecordStream, SphereRecord, TriangleRecord};
 
 /// Records in memory, and how often they were read.
@@ -507,4 +509,45 @@ fn a_lamp_far_away_does_not_stretch_the_grid() {
     let dark = manifest(&records);
     assert!(dark.grid.subdiv > near.grid.subdiv);
     assert_eq!((dark.grid.inner_lo, dark.grid.inner_hi), (dark.lo, dark.hi));
+}
+
+/// Blocks that others build of what was packed make the manifest and the objects of a scene that one process prepares.
+#[test]
+fn a_draft_with_its_blocks_is_the_scene() {
+    let records = scene(3, 3000);
+    for (splits, reduce) in [(7, true), (7, false), (1, true)] {
+        let (whole, parts) = (MemoryObjects::default(), MemoryObjects::default());
+        let wanted = run(&records, &settings(splits, reduce), &whole).unwrap();
+        let (source, packed) = (List::new(records.clone()), MemoryObjects::default());
+        let keep = |bytes: &[u8]| packed.put(ObjectKind::Geometry, bytes);
+        let of = |least| {
+            let (description, settings) = (description("list"), settings(splits, reduce));
+            let apart = Apart { least, keep: &keep };
+            draft(&description, &source, &settings, &SpoolSettings::default(), (&parts, &apart), &NoProgress).unwrap()
+        };
+        let Outcome::Draft(first) = of(2) else {
+            assert_eq!(splits, 1, "one split is built where it is cut");
+            continue;
+        };
+        assert!(parts.names().unwrap().is_empty(), "a draft has no name");
+        // a draft is a manifest in all but what it names
+        let first = Manifest::decode(&first.encode()).unwrap();
+        let blocks: Vec<ObjectRef> = (0..)
+            .zip(&first.splits)
+            .map(|(number, split)| {
+                let bytes = packed.get(&split.geometry).unwrap();
+                assert!(bytes.len() as u64 <= packed_most(split.triangles + split.spheres));
+                assert!(matches!(build(number, &bytes[1..], false), Err(PrepareError::Inconsistent(_))));
+                let block = build(number, &bytes, number % 2 == 0).unwrap();
+                parts.put(ObjectKind::Geometry, &block).unwrap()
+            })
+            .collect();
+        assert!(complete(first.clone(), &blocks[1..]).is_err());
+        let weights: Vec<u64> = first.splits.iter().map(|s| s.weight()).collect();
+        let made = complete(first, &blocks).unwrap();
+        assert_eq!(made.encode(), wanted.manifest.encode());
+        assert_eq!(made.splits.iter().map(|s| s.weight()).collect::<Vec<_>>(), weights, "known before");
+        assert!(made.objects().all(|o| parts.get(o).is_ok()));
+        assert!(matches!(of(u64::MAX), Outcome::Prepared(p) if p.manifest == made), "a small scene");
+    }
 }

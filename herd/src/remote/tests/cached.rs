@@ -164,7 +164,7 @@ fn what_a_worker_has_cached_makes_it_a_holder_and_is_read_from_s3_no_more() {
             let station = worker(&server, &cluster, &wire, number).caching(copies);
             scope.spawn(move || station.run().unwrap());
         }
-        let prepare = Work::Prepare { spec: Box::new(spec.clone()), replicas: 1 };
+        let prepare = Work::Prepare { spec: Box::new(spec.clone()), replicas: 1, apart: None, beside: vec![] };
         let Done::Prepared { scene: reference, .. } = fleet.call(prepare).unwrap() else { panic!("not prepared") };
         let store = Arc::new(depot.replicated(1).unwrap());
         let objects: Arc<dyn ObjectStore> =
@@ -258,7 +258,16 @@ fn of_what_a_cache_holds_the_latest_word_counts() {
     let say = |stage: &str, holds: Option<Holds>| {
         let (stage, home) = (Some(stage.into()), None);
         fleet
-            .answer(&over(&Poll { worker: worker(), home, stage, clerk: false, bands: true, aovs: true, holds }))
+            .answer(&over(&Poll {
+                worker: worker(),
+                home,
+                stage,
+                clerk: false,
+                bands: true,
+                aovs: true,
+                builds: true,
+                holds,
+            }))
             .unwrap()
     };
     let held = || fleet.holders().unwrap().iter().map(|on| !on.is_empty()).collect::<Vec<_>>();

@@ -325,3 +325,30 @@ async fn conforms_on_a_real_server() {
         assert!(matches!(&error, StoreError::NoBucket { .. }), "{error:?}");
     }
 }
+
+#[tokio::test]
+async fn a_listing_tells_contents_apart() {
+    let server = S3Server::start().await;
+    let store = S3Store::connect(server.settings("p")).await.unwrap();
+    let tag = async |key: &str| {
+        let listed = store.list_versions("").await.unwrap().expect("S3 has tags");
+        let found = listed.into_iter().find(|v| v.key == key).unwrap();
+        assert_eq!(found.bytes, 4);
+        found.tag
+    };
+    store.put("a", Bytes::from_static(b"body")).await.unwrap();
+    store.put("b", Bytes::from_static(b"body")).await.unwrap();
+    let first = tag("a").await;
+    // MD5 of "body", as S3 has it for what is put in one piece
+    assert_eq!(first, "841a2d689ad86bd1611447453c22c6fc");
+    assert_eq!(tag("b").await, first);
+    store.put("a", Bytes::from_static(b"Body")).await.unwrap();
+    assert_ne!(tag("a").await, first);
+    store.put("a", Bytes::from_static(b"body")).await.unwrap();
+    assert_eq!(tag("a").await, first);
+    // in pages as well
+    for i in 0..1001 {
+        server.put_raw(Box::leak(format!("p/many/{i}").into_boxed_str()), b"x");
+    }
+    assert_eq!(store.list_versions("many/").await.unwrap().map(|v| v.len()), Some(1001));
+}

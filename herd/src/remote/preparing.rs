@@ -1,0 +1,221 @@
+//! The operator's side of preparing: one worker cuts the source into splits, all of them build the blocks.
+//!
+//! What the first one packed lies below the job's own prefix, on the stores where the blocks are to lie, until the scene has its name. A worker
+//! that goes takes no more with it than the few splits that it had in hand. A scene that is small, or that is prepared for one worker, is
+//! prepared by one.
+
+use std::sync::Arc;
+
+use rayherd_scene::manifest::Manifest;
+use rayherd_scene::objects::{ObjectRef, ObjectStore};
+use rayherd_scene::prepare::complete;
+
+use super::blocks::{by_name, key, lost};
+use super::frames::{Job, Keeper};
+use super::homes::Homes;
+use super::listing::{self, Listing};
+use super::message::{Apart, Done, ToBuild, Work};
+use crate::job::{JobError, PreparedScene};
+use crate::store::{BlockStore, SceneObjects};
+
+/// Usable primitives of a scene from which on its blocks are built by all workers: some seconds of one thread's work, for which 44 bytes
+/// each are written and read once more.
+pub const APART: u64 = 1 << 20;
+/// Pieces of work for each slot: what is given out last, or again after a death, is small beside the whole.
+const PIECES: u64 = 4;
+/// How often a scene is cut again whose primitives were lost on the way.
+const MOST_CUTS: u32 = 3;
+
+/// What preparing came to: the manifest, whether it was there already, and cells of volumes that were not looked into.
+type Scene = (ObjectRef, bool, u64);
+
+/// Has workers prepare the scene of a job, unless it is prepared.
+///
+/// # Errors
+/// When it cannot be prepared, or the job was cancelled.
+pub fn prepared(job: &Job, keeper: &dyn Keeper, replicas: u32) -> Result<Scene, JobError> {
+    let listing = Listing::of(job);
+    let name = listing.as_ref().and_then(|l| l.name(job.spec));
+    if let Some(reference) = name.as_ref().and_then(|name| listing::find(job, replicas, name)) {
+        return Ok((reference, true, 0));
+    }
+    let prefix = format!("{}/prepare", job.prefix);
+    let apart = (job.slots.len() > 1).then(|| Apart { prefix: prefix.clone(), least: job.apart });
+    let is_apart = apart.is_some();
+    let done = by_workers((job, keeper, replicas), apart, listing.as_ref(), name.as_deref());
+    // whoever goes on with the job may be at it already
+    if is_apart && !matches!(done, Err(JobError::Owned(_))) {
+        clean(job, &prefix);
+    }
+    if let (Ok(scene), Some(name)) = (&done, &name)
+        && Listing::of(job) == listing
+    {
+        listing::set(job, replicas, name, &scene.0);
+    }
+    done
+}
+
+fn by_workers(
+    (job, keeper, replicas): (&Job, &dyn Keeper, u32),
+    apart: Option<Apart>,
+    listing: Option<&Listing>,
+    name: Option<&str>,
+) -> Result<Scene, JobError> {
+    let beside = listing.map(Listing::holders).unwrap_or_default();
+    let spec = Box::new(job.spec.clone());
+    let work = Work::Prepare { spec, replicas, apart: apart.clone(), beside };
+    let prefix = apart.map(|a| a.prefix).unwrap_or_default();
+    let (mut begun, mut cuts): (Option<Begun>, u32) = (None, 0);
+    loop {
+        // whose turn it is must have who does it: jobs that wait with their workers may leave no room for its own
+        job.fleet.staffed()?;
+        // of two jobs that come at once with one scene, the second finds it prepared
+        let _turn = job.turns.take(&job.spec.scene.source, || job.fleet.check())?;
+        if begun.is_none() {
+            if let Some(reference) = name.and_then(|name| listing::find(job, replicas, name)) {
+                return Ok((reference, true, 0));
+            }
+            let draft = match job.fleet.call_while_staffed(work.clone())? {
+                Some(Done::Prepared { scene, reused, cells_passed }) => {
+                    return Ok((scene, reused, cells_passed));
+                }
+                Some(Done::Drafted { draft, cells_passed }) => Begun::open(job, replicas, &prefix, draft, cells_passed),
+                Some(_) => return Err(JobError::Internal("a worker reports something else than it was to do".into())),
+                None => {
+                    tracing::warn!("the worker that was to prepare the scene is gone: others come first");
+                    continue;
+                }
+            };
+            cuts += 1;
+            begun = match draft {
+                Ok(draft) => {
+                    keeper.cut(&draft.bytes(job.depot.len()));
+                    Some(draft)
+                }
+                Err(e) => again(e, cuts)?,
+            };
+        }
+        let Some(draft) = begun.as_mut() else { continue };
+        match draft.build(job, replicas, &prefix) {
+            Ok(true) => return draft.finish(job, replicas),
+            Ok(false) => tracing::warn!("all workers that were to build blocks are gone: others come first"),
+            Err(e) => begun = again(e, cuts)?,
+        }
+    }
+}
+
+/// What lies in between is lost: the scene is cut again, but not for ever. Other errors are what they are.
+fn again(e: JobError, cuts: u32) -> Result<Option<Begun>, JobError> {
+    if cuts >= MOST_CUTS || !matches!(e, JobError::Lost { .. }) {
+        return Err(e);
+    }
+    tracing::warn!("{e}; the scene is cut again");
+    Ok(None)
+}
+
+/// A scene that is cut and whose blocks are not all built.
+struct Begun {
+    draft: PreparedScene,
+    /// Stores of each split.
+    places: Vec<Vec<u32>>,
+    blocks: Vec<Option<ObjectRef>>,
+    cells_passed: u64,
+}
+
+impl Begun {
+    fn open(job: &Job, replicas: u32, prefix: &str, draft: ObjectRef, cells_passed: u64) -> Result<Self, JobError> {
+        let store = job.depot.view(1, Some(by_name()), None)?;
+        let body = job.runtime.block_on(store.get(&key(prefix, &draft))).map_err(lost)?;
+        let draft = PreparedScene::open(Manifest::decode(&body)?, objects(job, replicas)?)?;
+        let places = Homes::of(&draft, job.depot.len(), replicas).splits().to_vec();
+        let blocks = vec![None; places.len()];
+        Ok(Begun { draft, places, blocks, cells_passed })
+    }
+
+    /// Bytes of blocks by store, as far as they are known.
+    fn bytes(&self, stores: u32) -> Vec<u64> {
+        let mut bytes = vec![0; stores as usize];
+        for (split, on) in self.draft.manifest.splits.iter().zip(&self.places) {
+            on.iter().for_each(|&n| bytes[n as usize] += split.weight());
+        }
+        bytes
+    }
+
+    /// What is left to do, in pieces of about equal bytes. Those of one home are together, so that a worker beside it reads and writes there.
+    fn pieces(&self, slots: u64) -> Vec<Vec<ToBuild>> {
+        let splits = (0u32..).zip(&self.draft.manifest.splits).zip(&self.places).zip(&self.blocks);
+        let mut left: Vec<ToBuild> = splits
+            .filter(|(_, block)| block.is_none())
+            .map(|(((number, split), on), _)| ToBuild {
+                number,
+                primitives: split.triangles + split.spheres,
+                packed: split.geometry,
+                on: on.clone(),
+            })
+            .collect();
+        left.sort_by_key(|s| (s.on.first().copied(), s.number));
+        let most = left.iter().map(|s| s.packed.bytes).sum::<u64>().div_ceil(PIECES * slots.max(1));
+        let mut pieces: Vec<Vec<ToBuild>> = Vec::new();
+        let mut bytes = 0;
+        for split in left {
+            let joins = |piece: &&mut Vec<ToBuild>| {
+                bytes + split.packed.bytes <= most && piece.last().is_some_and(|l| l.on.first() == split.on.first())
+            };
+            match pieces.last_mut().filter(joins) {
+                Some(piece) => {
+                    bytes += split.packed.bytes;
+                    piece.push(split);
+                }
+                None => {
+                    bytes = split.packed.bytes;
+                    pieces.push(vec![split]);
+                }
+            }
+        }
+        pieces
+    }
+
+    /// Has blocks built; whether all of them are.
+    fn build(&mut self, job: &Job, replicas: u32, prefix: &str) -> Result<bool, JobError> {
+        let pieces = self.pieces(job.slots.iter().map(|&s| u64::from(s)).sum());
+        let work = |splits: &Vec<ToBuild>| Work::Build { prefix: prefix.to_owned(), splits: splits.clone(), replicas };
+        let done = job.fleet.call_all_while_staffed(pieces.iter().map(work).collect())?;
+        for (piece, done) in pieces.iter().zip(done) {
+            match done {
+                Some(Done::Built { blocks }) if blocks.len() == piece.len() => {
+                    piece.iter().zip(blocks).for_each(|(s, block)| self.blocks[s.number as usize] = Some(block));
+                }
+                Some(_) => return Err(JobError::Internal("a worker reports something else than it was to do".into())),
+                None => {}
+            }
+        }
+        Ok(self.blocks.iter().all(Option::is_some))
+    }
+
+    /// Stores the manifest, and lets its name point to it.
+    fn finish(&self, job: &Job, replicas: u32) -> Result<Scene, JobError> {
+        let blocks: Vec<ObjectRef> = self.blocks.iter().flatten().copied().collect();
+        let manifest = complete(self.draft.manifest.clone(), &blocks).map_err(|e| JobError::Scene(e.to_string()))?;
+        // what a worker got wrong must not get a name
+        let manifest = Manifest::decode(&manifest.encode())?;
+        let reference = manifest.store(objects(job, replicas)?.as_ref())?;
+        Ok((reference, false, self.cells_passed))
+    }
+}
+
+fn objects(job: &Job, replicas: u32) -> Result<Arc<dyn ObjectStore>, JobError> {
+    Ok(Arc::new(SceneObjects::new(Arc::new(job.depot.replicated(replicas)?), job.runtime.clone())?))
+}
+
+/// Deletes what lay in between. What a store keeps that does not answer goes with the job.
+fn clean(job: &Job, prefix: &str) {
+    for store in job.depot.stores() {
+        let done = job.runtime.block_on(async {
+            let keys: Vec<String> = store.list(&format!("{prefix}/")).await?.into_iter().map(|(key, _)| key).collect();
+            if keys.is_empty() { Ok(()) } else { store.delete(&keys).await }
+        });
+        if let Err(e) = done {
+            tracing::warn!("what is left of preparing goes with the job: {e}");
+        }
+    }
+}
