@@ -256,7 +256,8 @@ impl S3Store {
                 StoreError::Denied { store, action, key, message }
             }
             ("InvalidAccessKeyId", _) => {
-                let message = format!("{message}: the server does not know this key: give another, or have it made there");
+                let message =
+                    format!("{message}: the server does not know this key: give another, or have it made there");
                 StoreError::Denied { store, action, key, message }
             }
             _ => StoreError::Denied { store, action, key, message },

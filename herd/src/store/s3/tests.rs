@@ -122,7 +122,8 @@ async fn a_refusal_says_what_to_do() {
         ("InvalidAccessKeyId", 403, "does not know this key"),
         ("XMinioStorageFull", 507, "no room for k (7 bytes): free some or add some"),
     ] {
-        let error = store.classify("put", "k".into(), 7, status, code, format!("{code}: no (HTTP {status})")).to_string();
+        let error =
+            store.classify("put", "k".into(), 7, status, code, format!("{code}: no (HTTP {status})")).to_string();
         assert!(error.contains(part) && error.contains("k"), "{error}");
     }
 }
