@@ -124,7 +124,7 @@ async fn a_refusal_says_what_to_do() {
     ] {
         let error =
             store.classify("put", "k".into(), 7, status, code, format!("{code}: no (HTTP {status})")).to_string();
-        assert!(error.contains(part) && error.contains("k"), "{error}");
+        assert!(error.contains(part), "{error}");
     }
 }
 
