@@ -248,6 +248,18 @@ impl S3Store {
                 let message = format!("{message}, without a reason: the server may still be starting");
                 StoreError::Unavailable { store, action, key, message }
             }
+            ("AccessDenied" | "AllAccessDisabled", _) => {
+                let message = format!(
+                    "{message}: its key may not do that in this bucket: have it allowed to list, get, put and delete objects there, or give \
+                     another key"
+                );
+                StoreError::Denied { store, action, key, message }
+            }
+            ("InvalidAccessKeyId", _) => {
+                let message =
+                    format!("{message}: the server does not know this key: give another, or have it made there");
+                StoreError::Denied { store, action, key, message }
+            }
             _ => StoreError::Denied { store, action, key, message },
         }
     }

@@ -113,6 +113,21 @@ async fn a_refusal_without_a_reason_passes_one_with_a_reason_does_not() {
     }
 }
 
+#[tokio::test]
+async fn a_refusal_says_what_to_do() {
+    let server = S3Server::start().await;
+    let store = S3Store::connect(server.settings("p")).await.unwrap();
+    for (code, status, part) in [
+        ("AccessDenied", 403, "allowed to list, get, put and delete objects"),
+        ("InvalidAccessKeyId", 403, "does not know this key"),
+        ("XMinioStorageFull", 507, "no room for k (7 bytes): free some or add some"),
+    ] {
+        let error =
+            store.classify("put", "k".into(), 7, status, code, format!("{code}: no (HTTP {status})")).to_string();
+        assert!(error.contains(part), "{error}");
+    }
+}
+
 /// A store that sends files in parts of so many bytes.
 async fn in_parts(server: &S3Server, least: u64) -> S3Store {
     S3Store { parts: Parts { above: least, least }, ..S3Store::connect(server.settings("p")).await.unwrap() }
