@@ -379,6 +379,7 @@ impl<'l> Station<'l> {
             Work::Build { prefix, splits, replicas } => {
                 let alone = self.takes_all_threads(work);
                 let blocks = build_blocks(self.place(), prefix, splits, *replicas, alone, stop)?;
+                tracing::info!(splits = blocks.len(), "blocks built");
                 Ok(Done::Built { blocks })
             }
             Work::Attempt { attempt } => {

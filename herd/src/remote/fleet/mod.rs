@@ -3,21 +3,26 @@
 //! A worker that is not heard of for [`SILENCE`], or that starts again, has lost what it was doing. What it reports later
 //! is refused: its id is known no more.
 
-use std::collections::{BTreeMap, BTreeSet, VecDeque};
+mod state;
+mod tally;
+#[cfg(test)]
+mod tests;
+
 use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
 use rayherd_api::ByteSize;
 use tokio::sync::Notify;
 
-use super::deaths::{Deaths, Held, MOST_DEATHS, MOST_KILLED, Verdict, keys};
+use super::deaths::{Held, MOST_KILLED, Verdict, keys};
 use super::message::{Answer, Beat, Done, Failure, Holds, Poll, Report, Stage, Work, WorkerId};
 use crate::driver::{Event, Executor, Finished, Launch};
 use crate::job::JobError;
-use crate::ledger::TaskId;
-use crate::local::attempt::Made;
-use crate::local::slots::StopFlag;
 use crate::report::Bytes;
+
+use state::{Doing, State, What, halved};
+
+pub use tally::{Outcome, Tally, WorkerTally};
 
 /// A worker that is silent for so long is gone. It beats each second.
 pub const SILENCE: Duration = Duration::from_secs(10);
@@ -25,6 +30,9 @@ pub const SILENCE: Duration = Duration::from_secs(10);
 /// starts anew, or stores that are silent together for a moment, cost no job.
 const MOST_FAILURES: u32 = 30;
 const PATIENCE: Duration = Duration::from_secs(60);
+/// A worker that has been given work for so long and does not name it among what it does has never got the answer, which was lost on its
+/// way: longer than a worker waits for an answer.
+const UNHEARD: Duration = Duration::from_secs(25);
 
 /// The workers of one job.
 pub struct Fleet {
@@ -33,157 +41,6 @@ pub struct Fleet {
     told: Condvar,
     /// Something for workers that wait for work.
     wanted: Notify,
-}
-
-#[derive(Default)]
-struct State {
-    epoch: String,
-    next: u64,
-    stage: Option<Stage>,
-    /// The stage before memory was taken away from it: its name, and what a worker was to hold of the scene.
-    whole: (String, Option<u64>),
-    /// The least that a worker must hold of the scene: its largest split.
-    least: u64,
-    /// Tasks are to hold less from now on, and whoever plans them does not know yet.
-    less: bool,
-    deaths: Deaths,
-    /// Why the job cannot be done.
-    hopeless: Option<String>,
-    /// Stores that hold each split.
-    placement: Vec<Vec<u32>>,
-    workers: Vec<Option<Worker>>,
-    /// For any worker.
-    common: VecDeque<(u64, Work)>,
-    doing: BTreeMap<String, Doing>,
-    finished: VecDeque<Finished>,
-    /// Workers that went away since this was told last.
-    emptied: BTreeSet<u32>,
-    answers: BTreeMap<u64, Result<Done, Failure>>,
-    /// Since the last success.
-    failures: u32,
-    failing: Option<Instant>,
-    bytes: Bytes,
-    cpu: f64,
-    cache_failures: u64,
-    hops: u64,
-    outcomes: BTreeMap<Outcome, u64>,
-    by_worker: BTreeMap<u32, WorkerTally>,
-    /// Splits and texture tiles that somebody has read in this stage.
-    read: [BTreeSet<u32>; 2],
-    first_attempt: Option<Instant>,
-    over: bool,
-    /// Another fleet has the workers now.
-    retired: bool,
-    cancelled: Option<String>,
-}
-
-struct Worker {
-    session: String,
-    home: Option<u32>,
-    seen: Instant,
-    ready: VecDeque<(TaskId, u32, Work, StopFlag)>,
-    /// It has the current stage open.
-    open: bool,
-    /// It can take a band out of a film part.
-    bands: bool,
-    /// It was told of that it cannot do what the stage asks for.
-    unfit: bool,
-    /// What its cache holds of the current stage's scene.
-    holds: Holds,
-}
-
-impl Worker {
-    /// What was told later counts, in whatever order it came.
-    fn told(&mut self, holds: Option<&Holds>) {
-        if let Some(holds) = holds.filter(|h| h.version > self.holds.version) {
-            self.holds = holds.clone();
-        }
-    }
-}
-
-struct Doing {
-    worker: u32,
-    what: What,
-    held: Held,
-}
-
-enum What {
-    Attempt { task: TaskId, number: u32, stop: StopFlag },
-    Call { call: u64, work: Work },
-}
-
-/// How an attempt at a task ended.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
-pub enum Outcome {
-    /// With a result.
-    Made,
-    /// It was given back, or another one had done the task.
-    Stopped,
-    /// Its worker went away.
-    Gone,
-    /// What it was to work on was lost.
-    Lost,
-    /// It failed.
-    Failed,
-}
-
-impl Outcome {
-    /// All of them.
-    pub const ALL: [Outcome; 5] = [Outcome::Made, Outcome::Stopped, Outcome::Gone, Outcome::Lost, Outcome::Failed];
-
-    /// Its name in metrics.
-    pub fn name(self) -> &'static str {
-        match self {
-            Outcome::Made => "made",
-            Outcome::Stopped => "stopped",
-            Outcome::Gone => "gone",
-            Outcome::Lost => "lost",
-            Outcome::Failed => "failed",
-        }
-    }
-
-    fn of(result: &Result<Done, Failure>) -> Self {
-        match result {
-            Ok(_) => Outcome::Made,
-            Err(Failure::Stopped) => Outcome::Stopped,
-            Err(Failure::Lost { .. }) => Outcome::Lost,
-            Err(Failure::ForNow { .. } | Failure::ForGood { .. }) => Outcome::Failed,
-        }
-    }
-}
-
-/// What one worker has done so far.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct WorkerTally {
-    /// CPU-seconds of its work.
-    pub cpu: f64,
-    /// Bytes of scene data that it held in memory when it reported last.
-    pub resident: u64,
-}
-
-/// What a fleet has done so far, for the status of its job.
-#[derive(Clone, Debug, Default)]
-pub struct Tally {
-    /// Workers that are there.
-    pub ready: u32,
-    /// Bytes moved.
-    pub bytes: Bytes,
-    /// CPU-seconds of all work.
-    pub cpu: f64,
-    /// Copies that workers' caches could not keep, or have lost.
-    pub cache_failures: u64,
-    /// Rays that left a task for a split that it did not hold.
-    pub hops: u64,
-    /// Attempts that ended, by how.
-    pub outcomes: BTreeMap<Outcome, u64>,
-    /// By worker.
-    pub by_worker: BTreeMap<u32, WorkerTally>,
-    /// Work that nobody has taken yet.
-    pub queued: u64,
-    /// Work in workers' hands.
-    pub running: u64,
-    /// When the first attempt was handed out.
-    pub first_attempt: Option<Instant>,
 }
 
 impl Fleet {
@@ -390,7 +247,7 @@ impl Fleet {
         };
         state.next += 1;
         let held = Held { keys: keys(&work), level: matches!(what, What::Attempt { .. }).then_some(level) };
-        state.doing.insert(id.clone(), Doing { worker: poll.worker.number, what, held });
+        state.doing.insert(id.clone(), Doing { worker: poll.worker.number, since: Instant::now(), what, held });
         Ok(Answer::Work { id, work: Box::new(work) })
     }
 
@@ -458,6 +315,9 @@ impl Fleet {
     pub fn beat(&self, beat: &Beat) -> Result<Vec<String>, Unknown> {
         let mut state = self.lock();
         state.meet(&beat.worker, None)?;
+        if state.take_back(beat, UNHEARD) {
+            self.tell();
+        }
         let superfluous = |id: &&String| match state.doing.get(*id).map(|d| &d.what) {
             None => true,
             Some(What::Attempt { stop, .. }) => stop.is_set(),
@@ -577,195 +437,14 @@ impl Fleet {
 const GIVE_MORE: &str = "raise resources.limits.memory of the container worker in spec.workers.template (without it a pod gets \
      spec.workers.memory and 256Mi, and 256Mi more for each slot), or have fewer spec.workers.slots or a smaller spec.blockSize";
 
-/// Whether a home is one of these stores.
-fn is_beside(stores: &[u32], home: Option<u32>) -> bool {
-    home.is_some_and(|home| stores.contains(&home))
-}
-
 fn given_up() -> JobError {
     JobError::Internal("work was given up that was to be waited for".into())
-}
-
-/// Memory that was halved so often, but holds the largest split.
-fn halved(memory: Option<u64>, level: u32, least: u64) -> Option<u64> {
-    memory.map(|m| (m >> level).max(least.min(m)))
 }
 
 /// There is no worker of this number in the job.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("the job has no worker of this number")]
 pub struct Unknown;
-
-impl State {
-    /// What a worker is to hold of the scene at most, bytes.
-    fn memory(&self) -> Option<u64> {
-        halved(self.whole.1, self.deaths.level(), self.least)
-    }
-
-    /// Workers open the stage anew with the memory that is left to them; what none of them has begun goes back.
-    fn reopen(&mut self) {
-        let (memory, level) = (self.memory(), self.deaths.level());
-        let id = format!("{}+{level}", self.whole.0);
-        if let Some(stage) = &mut self.stage {
-            (stage.id, stage.memory) = (id, memory);
-        }
-        let workers = self.workers.iter_mut().flatten();
-        let ready: Vec<_> = workers
-            .flat_map(|w| {
-                w.open = false;
-                std::mem::take(&mut w.ready)
-            })
-            .collect();
-        ready.into_iter().for_each(|(task, number, ..)| self.lose(task, number));
-        self.emptied.clear();
-    }
-
-    /// Whether a worker is there beside one of these stores.
-    fn has_beside(&self, stores: &[u32]) -> bool {
-        self.workers.iter().flatten().any(|w| is_beside(stores, w.home))
-    }
-
-    /// Which of the common work a worker is given: the first that it can do. Blocks are built in whatever order: those that are to lie on the store
-    /// beside it come first.
-    fn common_for(&self, poll: &Poll) -> Option<usize> {
-        let can = |work: &Work| match work {
-            Work::Merge { band: Some(_), .. } => poll.bands,
-            // slots alone, so that as many trees are in memory as there are slots
-            Work::Build { .. } => poll.builds && !poll.clerk,
-            Work::Prepare { beside, .. } => is_beside(beside, poll.home) || !self.has_beside(beside),
-            _ => true,
-        };
-        let is_near = |work: &Work| match work {
-            Work::Build { splits, .. } => {
-                poll.home.is_some() && splits.first().is_some_and(|s| s.on.first().copied() == poll.home)
-            }
-            _ => false,
-        };
-        let mut all = (0..).zip(&self.common).filter(|(_, (_, work))| can(work));
-        let (first, (_, work)) = all.next()?;
-        if !matches!(work, Work::Build { .. }) || is_near(work) {
-            return Some(first);
-        }
-        Some(all.find(|(_, (_, work))| is_near(work)).map_or(first, |(at, _)| at))
-    }
-
-    /// Notes that a worker is there; whether it was not before.
-    fn meet(&mut self, worker: &WorkerId, home: Option<u32>) -> Result<bool, Unknown> {
-        let number = worker.number as usize;
-        let known = self.workers.get(number).ok_or(Unknown)?.as_ref();
-        let newcomer = known.is_none_or(|w| w.session != worker.session);
-        if newcomer {
-            self.leave(worker.number);
-            if let Some(what) = self.deaths.began(worker.number, &worker.session) {
-                self.hopeless = Some(format!(
-                    "{what}: {MOST_DEATHS} times the worker that had it in hand died: the pods' last logs (kubectl logs --previous) and \
-                     kubectl describe say of what"
-                ));
-            }
-            let (session, seen) = (worker.session.clone(), Instant::now());
-            let (ready, holds) = (VecDeque::new(), Holds::default());
-            let worker = Worker { session, home, seen, ready, open: false, bands: true, unfit: false, holds };
-            self.workers[number] = Some(worker);
-        }
-        if let Some(w) = &mut self.workers[number] {
-            w.seen = Instant::now();
-            w.home = home.or(w.home);
-        }
-        Ok(newcomer)
-    }
-
-    /// A worker is gone: what it did is lost, what any worker can do is done by another. Whether it was there.
-    fn leave(&mut self, number: u32) -> bool {
-        let Some(worker) = self.workers.get_mut(number as usize).and_then(Option::take) else { return false };
-        if let Some(tally) = self.by_worker.get_mut(&number) {
-            tally.resident = 0;
-        }
-        self.emptied.insert(number);
-        let held = self.doing.values().filter(|d| d.worker == number).map(|d| d.held.clone()).collect();
-        self.deaths.left(number, &worker.session, held);
-        for (task, attempt, _, _) in worker.ready {
-            self.lose(task, attempt);
-        }
-        let ids: Vec<String> =
-            self.doing.iter().filter(|(_, d)| d.worker == number).map(|(id, _)| id.clone()).collect();
-        for id in ids {
-            match self.doing.remove(&id).map(|d| d.what) {
-                Some(What::Attempt { task, number, .. }) => self.lose(task, number),
-                Some(What::Call { call, work }) => self.common.push_front((call, work)),
-                None => {}
-            }
-        }
-        true
-    }
-
-    fn lose(&mut self, task: TaskId, number: u32) {
-        *self.outcomes.entry(Outcome::Gone).or_default() += 1;
-        let (result, bytes) = (Err(JobError::Stopped), Bytes::default());
-        self.finished.push_back(Finished { task, number, result, cpu: 0.0, bytes });
-    }
-
-    /// A worker cannot do what the stage asks for, and would not say so: it gets nothing to do.
-    fn set_unfit(&mut self, number: u32) {
-        let worker = self.workers[number as usize].as_mut();
-        if worker.is_some_and(|w| !std::mem::replace(&mut w.unfit, true)) {
-            tracing::warn!(
-                "worker {number} is of a version that knows no layers beside the picture, which the job asks for: it gets nothing to do until \
-                 its pod is made again of the current version"
-            );
-        }
-    }
-
-    /// Lets silent workers go; whether there were any.
-    fn sweep(&mut self) -> bool {
-        let silent = |w: &Option<Worker>| w.as_ref().is_some_and(|w| w.seen.elapsed() >= SILENCE);
-        let gone: BTreeSet<u32> =
-            (0..self.workers.len() as u32).filter(|&n| silent(&self.workers[n as usize])).collect();
-        for &number in &gone {
-            tracing::warn!("worker {number} is silent: what it did is done again");
-            self.leave(number);
-        }
-        !gone.is_empty()
-    }
-
-    fn is_staffed(&self) -> bool {
-        self.workers.iter().any(Option::is_some)
-    }
-
-    /// Counts a failure that may pass by itself; whether that is still to be hoped for.
-    fn may_pass(&mut self) -> bool {
-        self.failures += 1;
-        let since = *self.failing.get_or_insert_with(Instant::now);
-        self.failures <= MOST_FAILURES || since.elapsed() < PATIENCE
-    }
-    fn succeeded(&mut self) {
-        (self.failures, self.failing) = (0, None);
-    }
-
-    fn check(&self) -> Result<(), JobError> {
-        if let Some(why) = &self.hopeless {
-            return Err(JobError::Settings(why.clone()));
-        }
-        self.cancelled.as_ref().map_or(Ok(()), |why| Err(JobError::Owned(why.clone())))
-    }
-
-    /// What an attempt's result means to the loop over rounds.
-    fn judge(&mut self, result: Result<Done, Failure>) -> Result<Made, JobError> {
-        match result {
-            Ok(Done::Made { outputs, hops, skipped }) => {
-                self.succeeded();
-                Ok(Made { outputs, film: None, hops, skipped })
-            }
-            Ok(_) => Err(JobError::Internal("a worker reports something else than it was to do".into())),
-            Err(Failure::Stopped) => Err(JobError::Stopped),
-            Err(Failure::Lost { name, why }) => Err(JobError::Lost { name, why }),
-            Err(Failure::ForNow { message }) if self.may_pass() => {
-                tracing::warn!("{message}; trying again");
-                Err(JobError::Stopped)
-            }
-            Err(Failure::ForNow { message } | Failure::ForGood { message }) => Err(JobError::Settings(message)),
-        }
-    }
-}
 
 impl Executor for Fleet {
     fn is_up(&self, node: u32) -> bool {
