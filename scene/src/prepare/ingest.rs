@@ -154,7 +154,7 @@ pub(crate) fn ingest(
     }
     let Reader { spool, counts, lo, hi, dark, emissive, glows, .. } = reader;
     // where there is nothing at all, that is said instead
-    if counts.triangles + counts.spheres > 0 {
+    if counts.degenerate > 0 && counts.triangles + counts.spheres > 0 {
         lit(description, &emissive)?;
     }
     Ok(Ingested { spool, counts, lo, hi, dark, emissive, glows, hash: hasher.finalize() })

@@ -162,9 +162,9 @@ fn workers_that_die_cost_what_they_had_in_hand() {
                     .iter()
                     .for_each(|s| cluster.runtime.block_on(s.delete(std::slice::from_ref(&key))).unwrap());
             }
-            // nobody is left; what the first one builds all the same counts for nobody
-            fleet.gone(&WorkerId { number: 1, session: "first".into() });
+            // nobody is left; one that was only said to be gone might ask for work once more
             first.leave();
+            fleet.gone(&WorkerId { number: 1, session: "first".into() });
             gate.closed.store(false, Ordering::Relaxed);
             for number in 0..3 {
                 let station = gate.station(cluster, number, "last");
