@@ -130,8 +130,8 @@ unsafe fn four_by_four<const ANY: bool>(leaf: *const f32, n: usize, line: &Line,
     // SAFETY: rows of n values lie in the leaf; four are read from places below n, at most 12 bytes past a row's end.
     unsafe {
         let all = |x: f64| _mm256_set1_pd(x);
-        let [ox, oy, oz] = line.o.map(|x| all(x));
-        let [dx, dy, dz] = line.d.map(|x| all(x));
+        let [ox, oy, oz] = line.o.map(all);
+        let [dx, dy, dz] = line.d.map(all);
         let dd = all(line.dd);
         let (tmin, tmax) = (_mm_set1_ps(state.tmin), _mm_set1_ps(state.tmax));
         // sums from left to right and no fused operations, as the plain one's
