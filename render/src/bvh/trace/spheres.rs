@@ -175,7 +175,7 @@ unsafe fn four_by_four<const ANY: bool>(leaf: *const f32, n: usize, line: &Line,
     }
 }
 
-/// [`scalar::enter_children`].
+/// Pushes those of a node's children that the ray enters, slot by slot, as the plain kernel does.
 ///
 /// # Safety
 /// `node` is a node; features of `I` are enabled.
