@@ -127,17 +127,73 @@ def told(points: list, target: float) -> str:
     return f"more than {time:.2f} CPU-s (relMSE {least:.2e} there)" if least > target else f"less than {min(t for t, _ in points):.2f} CPU-s"
 
 
-def plot(rows: list, names: list, path: Path) -> None:
-    drawn, axes = figure(2, len(names), (5.5 * len(names), 9))
+def points(rows: list, key: str, repeat: int | None = None) -> list:
+    """Time and error of each number of samples: of one repeat, or the median time and mean error of all."""
+    rows = [r for r in rows if repeat is None or r["repeat"] == repeat]
+    spps = sorted({r["spp"] for r in rows})
+    return [(float(np.median([r[key] for r in rows if r["spp"] == s])), float(np.mean([r["rel_mse"] for r in rows if r["spp"] == s]))) for s in spps]
+
+
+def compare(rows: list, scene: str, target: float) -> list:
+    """Our time to the error over each peer's, repeat by repeat: median, least and largest, for CPU from process start, CPU of rendering alone, wall seconds.
+
+    A ratio is there only where the runs of both bracket the error; where a peer's longest run did not get there, it is taken as its time and the
+    ratio is marked `below`: the true one is smaller.
+    """
+    mine = [r for r in rows if r["scene"] == scene and r["renderer"] == "rayherd"]
+    out = []
+    for peer in dict.fromkeys(r["renderer"] for r in rows if r["scene"] == scene and r["renderer"] != "rayherd"):
+        theirs = [r for r in rows if r["scene"] == scene and r["renderer"] == peer]
+        for key in ("cpu_s", "render_cpu_s", "wall_s"):
+            ratios, below = [], False
+            for repeat in sorted({r["repeat"] for r in theirs}):
+                a, curve = at_error(points(mine, key, repeat), target), points(theirs, key, repeat)
+                b = at_error(curve, target)
+                if b is None and min(e for _, e in curve) > target:
+                    b, below = max(t for t, _ in curve), True
+                if a is not None and b is not None:
+                    ratios.append(a / b)
+            if ratios:
+                out.append({"scene": scene, "peer": peer, "of": key, "rel_mse": target, "pairs": len(ratios), "below": below, "ratio": round(float(np.median(ratios)), 4),
+                            "least": round(min(ratios), 4), "largest": round(max(ratios), 4)})
+    return out
+
+
+def merge(path: Path, rows: list, key: str) -> list:
+    """What the file has of other scenes, and the new rows, written back: scenes may be measured in several runs of a day."""
+    new = {r[key] for r in rows}
+    kept = []
+    if path.exists():
+        with open(path, newline="") as f:
+            # a file of other columns is of an older version of this program
+            kept = [r for r in csv.DictReader(f) if r[key] not in new and set(r) == set(rows[0])]
+    for r in kept:
+        for k, v in r.items():
+            if isinstance(rows[0][k], bool):
+                r[k] = v == "True"
+            elif not isinstance(rows[0][k], str):
+                r[k] = type(rows[0][k])(v)
+    rows = kept + rows
+    with open(path, "w", newline="") as f:
+        w = csv.DictWriter(f, rows[0])
+        w.writeheader()
+        w.writerows(rows)
+    return rows
+
+
+def plot(rows: list, path: Path) -> None:
+    names = list(dict.fromkeys(r["scene"] for r in rows))
+    drawn, axes = figure(2, len(names), (4.5 * len(names), 8))
     for column, scene in enumerate(names):
         for row, (key, label) in enumerate([("cpu_s", "CPU-seconds from process start"), ("wall_s", "wall seconds from process start")]):
             ax = axes[row][column]
-            for renderer in dict.fromkeys(r["renderer"] for r in rows):
+            # of all renderers, so that one has the same colour in each plot
+            for number, renderer in enumerate(dict.fromkeys(r["renderer"] for r in rows)):
                 mine = [r for r in rows if r["scene"] == scene and r["renderer"] == renderer]
-                spps = sorted({r["spp"] for r in mine})
-                xs = [np.median([r[key] for r in mine if r["spp"] == s]) for s in spps]
-                ys = [np.mean([r["rel_mse"] for r in mine if r["spp"] == s]) for s in spps]
-                ax.loglog(xs, ys, "o-", label=renderer)
+                if mine:
+                    curve = points(mine, key)
+                    ax.loglog([t for t, _ in curve], [e for _, e in curve], "o-", color=f"C{number}", label=renderer)
+            ax.axhline(TARGETS.get(scene, TARGET), color="grey", linestyle=":")
             ax.set(title=scene, xlabel=label, ylabel="relMSE")
             ax.grid(True, which="both", alpha=0.3)
             ax.legend()
@@ -175,27 +231,19 @@ def main() -> None:
                            "render_cpu_s": round(got["render"], 3), "rel_mse": error(ref, got["image"]), "mean": float(got["image"].mean())}
                     rows.append(row)
                     print("{scene} {renderer} {spp} spp: {cpu_s:.2f} CPU-s ({render_cpu_s:.2f} without load), relMSE {rel_mse:.3e}".format(**row), flush=True)
-        seconds, least = {}, {}
         for r in renderers:
             mine = [x for x in rows if x["scene"] == name and x["renderer"] == r.name]
-            points = [(np.median([x["cpu_s"] for x in mine if x["spp"] == s]), np.mean([x["rel_mse"] for x in mine if x["spp"] == s])) for s in a.spp]
-            seconds[r.name] = at_error(points, target)
-            # of a peer that did not get there: it takes longer than its longest run
-            least[r.name] = seconds[r.name] or (max(t for t, _ in points) if min(e for _, e in points) > target else None)
-            print(f"{name} to relMSE {target}: {r.name} {told(points, target)}")
-        peers = [t for n, t in least.items() if n != "rayherd" and t]
-        if seconds["rayherd"] and peers:
-            best = min(peers)
-            bound = "" if best in seconds.values() else "below "
-            print(f"{name}: {bound}{seconds['rayherd'] / best:.3f} of the best peer's", flush=True)
+            print(f"{name} to relMSE {target}: {r.name} {told(points(mine, 'cpu_s'), target)}")
+        for c in compare(rows, name, target):
+            print("{scene}: {of} to relMSE {rel_mse} over {peer}'s: {0}{ratio:.3f} ({least:.3f} to {largest:.3f}, {pairs} repeats)".format("below " * c["below"], **c), flush=True)
     machine = next((l.split(":")[1].strip() for l in open("/proc/cpuinfo") if l.startswith("model name")), platform.machine())
-    stem = a.results / f"{datetime.date.today()}-{machine.replace(' ', '-')}"
-    with open(f"{stem}.csv", "w", newline="") as f:
-        w = csv.DictWriter(f, rows[0])
-        w.writeheader()
-        w.writerows(rows)
-    plot(rows, a.names, Path(f"{stem}.png"))
-    print(f"written to {stem}.csv and .png")
+    stem = a.results / f"{datetime.date.today()}-{'-'.join(machine.split()[:2])}"
+    ratios = [c for name in a.names for c in compare(rows, name, TARGETS.get(name, TARGET))]
+    rows = merge(Path(f"{stem}.csv"), rows, "scene")
+    if ratios:
+        merge(Path(f"{stem}-ratios.csv"), ratios, "scene")
+    plot(rows, Path(f"{stem}.svg"))
+    print(f"written to {stem}.csv, -ratios.csv and .svg")
 
 
 if __name__ == "__main__":
