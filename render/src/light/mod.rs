@@ -5,11 +5,13 @@
 //! chooses by the point that is lit. Nine tenths of the shares of shapes and beams go by power (luminance x area x pi), one tenth is dealt
 //! evenly; a primitive of a shape has its share of the area. Within the tree nothing is dealt evenly: these shares only say how often it is asked,
 //! and whoever may shine at the point has one number at least. The probabilities are multiples of 2^-32, intervals of integers, so one 32-bit
-//! number chooses exactly by them and both sides of MIS see the same ones.
+//! number chooses exactly by them. Where a surface is lit on one side, a tree, and the place on a triangle, take that into account; both sides of MIS see
+//! numbers that do not ([`Facing`] says why that is right).
 //! Without a tree, a primitive whose share is below 2^-32 is never chosen; its density is 0, and MIS leaves it to the BSDF.
 
 mod beam;
 mod bounds;
+mod facing;
 mod map;
 mod picture;
 mod sky;
@@ -31,11 +33,12 @@ use crate::real::{Vec3, f32};
 use crate::texture::At;
 use crate::world::{Beam, Glow, Primitive, World, sphere_uv};
 use bounds::Bounds;
+pub(crate) use facing::Facing;
 pub use map::{SkyMap, SkyMapError};
 use sky::Sky;
 pub use sphere::SphereLight;
 use tree::Tree;
-pub(crate) use tree::{Node, end};
+pub(crate) use tree::{Node, at_least, end};
 pub use triangle::TriangleLight;
 
 /// Share of the choice that is dealt evenly over the sources.
@@ -120,8 +123,10 @@ struct Picture {
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Choice {
     source: usize,
-    /// With which it is chosen at this point.
+    /// With which it is chosen at this point, as MIS sees it.
     pub probability: f32,
+    /// That over the true one.
+    pub worth: f32,
 }
 
 #[derive(Clone, Debug)]
@@ -139,11 +144,12 @@ pub struct LightSample {
     pub d: Vec3,
     /// Nothing nearer than this may be met; smaller than the distance of the source by the error of both.
     pub tmax: f32,
-    /// Radiance arriving from there if nothing is in between. Of a single direction: irradiance times 2^64.
+    /// Radiance arriving from there if nothing is in between, times the density `pdf` over the true one. Of a single direction: irradiance times 2^64.
     pub radiance: Vec3,
     /// A texture that this is multiplied by, and where it is looked up.
     pub look: Option<(u32, At)>,
-    /// Density in solid angle, the choice included. Of a single direction: 2^64 times the choice's probability, so that `radiance / pdf` is
+    /// Density in solid angle, the choice included, as both sides of MIS see it; the true one where the surface is lit from all around, but for roundings
+    /// of the choice. Of a single direction: 2^64 times the choice's probability, so that `radiance / pdf` is
     /// right and no other technique's density counts beside it.
     pub pdf: f32,
 }
@@ -323,25 +329,39 @@ impl Lights {
         });
     }
 
-    /// A direction from `o` to a source, by random bits: one number for the choice and two for the place. `None` when what was chosen shows
-    /// `o` its back: that sample is worth 0.
+    /// A direction from `o`, which is lit from all around, to a source, by random bits: one number for the choice and two for the place. `None` when what
+    /// was chosen shows `o` its back: that sample is worth 0.
     #[inline(always)]
     pub fn sample(&self, o: Vec3, choice: u32, place: [u32; 2]) -> Option<LightSample> {
-        self.sample_chosen(self.choose(o, choice).0?, o, place)
+        self.sample_chosen(self.choose(o, Facing::ANY, choice).0?, o, Facing::ANY, place)
     }
 
     /// The same of what was chosen, for callers that choose for many at once.
     #[inline]
-    pub(crate) fn sample_chosen(&self, choice: Choice, o: Vec3, place: [u32; 2]) -> Option<LightSample> {
-        let Choice { source, probability } = choice;
+    pub(crate) fn sample_chosen(
+        &self,
+        choice: Choice,
+        o: Vec3,
+        facing: Facing,
+        place: [u32; 2],
+    ) -> Option<LightSample> {
+        let Choice { source, probability, worth } = choice;
         let source = &self.sources[source];
-        let u = place.map(unit);
+        let mut u = place.map(unit);
+        let mut worth = worth;
         let (d, tmax, pdf) = match &source.geometry {
-            Geometry::Triangle(t) => t.sample(o, u)?,
+            Geometry::Triangle(t) => {
+                if !facing.is_any() {
+                    let warp;
+                    (u, warp) = t.warp(o, facing, u);
+                    worth *= warp;
+                }
+                t.sample(o, u)?
+            }
             Geometry::Sphere(s) => s.sample(o, u)?,
             Geometry::Beam(beam) => {
                 let (d, tmax, irradiance) = beam::sample(beam, o)?;
-                let radiance = irradiance * beam::SINGLE;
+                let radiance = irradiance * beam::SINGLE * worth;
                 let look = match beam {
                     Beam::Spot { slide: Some(slide), .. } => Some((slide.texture, At::uv(slide.uv(-d)))),
                     _ => None,
@@ -355,7 +375,7 @@ impl Lights {
         };
         let pdf = pdf * probability;
         let Some(picture) = source.picture else {
-            return Some(LightSample { d, tmax, radiance: source.emission, look: None, pdf });
+            return Some(LightSample { d, tmax, radiance: source.emission * worth, look: None, pdf });
         };
         let picture = &self.pictures[picture as usize];
         let at = match &source.geometry {
@@ -365,7 +385,7 @@ impl Lights {
                 picture.glow.on_triangle(s, t)
             }
         };
-        Some(LightSample { d, tmax, radiance: picture.factor, look: Some((picture.texture, at)), pdf })
+        Some(LightSample { d, tmax, radiance: picture.factor * worth, look: Some((picture.texture, at)), pdf })
     }
 
     /// A source that was chosen, if it is an even triangle, and its radiance.
@@ -404,7 +424,7 @@ impl Lights {
         }
     }
 
-    /// Density of [`Lights::sample`], from `o`, in the direction `d` that met the front of primitive `prim` at distance `t`, where the cosine
+    /// Density of light samples as MIS sees it, from `o`, in the direction `d` that met the front of primitive `prim` at distance `t`, where the cosine
     /// between the source's normal and the way back is `cos`. 0 for what is never sampled.
     #[inline(always)]
     pub fn pdf(&self, prim: PrimId, o: Vec3, t: f32, cos: f32) -> f32 {
@@ -417,21 +437,24 @@ impl Lights {
             Geometry::Beam(_) | Geometry::Sky => 0.0,
         };
         match &self.tree {
-            Some(tree) => pdf * probability(tree.numbers(o, number)),
+            Some(tree) => pdf * (tree.weight(o, number) * probability(tree.share())),
             None => pdf * source.probability,
         }
     }
 
-    /// The source in whose interval the number lies at the point, `None` where nothing shines there; and whether sources were left out on the
-    /// way to it, as they cannot shine there.
+    /// The source in whose interval the number lies at the point of a surface, `None` where nothing shines there; and whether sources were left out
+    /// on the way to it, as they cannot shine there.
     #[inline(always)]
-    pub(crate) fn choose(&self, o: Vec3, number: u32) -> (Option<Choice>, bool) {
+    pub(crate) fn choose(&self, o: Vec3, facing: Facing, number: u32) -> (Option<Choice>, bool) {
         let number = u64::from(number);
         if let Some(tree) = &self.tree
             && number < tree.share()
         {
-            let (chosen, fewer) = tree.choose(o, number);
-            let choice = |(source, numbers)| Choice { source, probability: probability(numbers) };
+            let (chosen, fewer) = tree.choose(o, facing, number);
+            let choice = |(source, numbers, weight)| {
+                let seen = weight * probability(tree.share());
+                Choice { source, probability: seen, worth: seen / probability(numbers) }
+            };
             return (chosen.map(choice), fewer);
         }
         let i = match self.ends.len() {
@@ -441,8 +464,8 @@ impl Lights {
             _ => self.ends.partition_point(|&end| end <= number),
         };
         let source = self.in_tree + i;
-        let choice = (i < self.ends.len()).then(|| Choice { source, probability: self.sources[source].probability });
-        (choice, false)
+        let choice = || Choice { source, probability: self.sources[source].probability, worth: 1.0 };
+        ((i < self.ends.len()).then(choice), false)
     }
 }
 

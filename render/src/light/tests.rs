@@ -122,7 +122,7 @@ fn both_sides_agree() {
         let choice = rng.u32();
         let Some(s) = lights.sample(o, choice, [rng.u32(), rng.u32()]) else { continue };
         assert!((s.d.length() - 1.0).abs() < 1e-6 && s.pdf > 0.0 && s.pdf.is_finite() && s.tmax >= 0.0);
-        let i = lights.choose(o, choice).0.unwrap().source;
+        let i = lights.choose(o, Facing::ANY, choice).0.unwrap().source;
         if i >= primitives.len() {
             assert!((s.pdf / lights.sky(s.d).1 - 1.0).abs() < 1e-6 && s.tmax == f32::INFINITY);
             continue;
@@ -157,7 +157,7 @@ fn textured_samples_look_where_they_point() {
         let Some(s) = lights.sample(o, choice, [rng.u32(), rng.u32()]) else { continue };
         let Some((0, at)) = s.look else { panic!("{s:?}") };
         assert_eq!(s.radiance, Vec3::splat(2.0));
-        let source = lights.choose(o, choice).0.unwrap().source;
+        let source = lights.choose(o, Facing::ANY, choice).0.unwrap().source;
         seen[source] += 1;
         let (o, d) = (o.as_dvec3(), s.d.as_dvec3());
         if source == 0 {
@@ -227,14 +227,14 @@ fn choice_is_by_power() {
     let mut counts = [0.0; 3];
     for i in 0..n {
         let number = (u64::from(i) * (1 << 32) / u64::from(n)) as u32;
-        counts[lights.choose(Vec3::ZERO, number).0.unwrap().source] += 1.0;
+        counts[lights.choose(Vec3::ZERO, Facing::ANY, number).0.unwrap().source] += 1.0;
     }
     for i in 0..3 {
         assert!((counts[i] / f64::from(n) - expected[i]).abs() < 2e-5, "{counts:?} {expected:?}");
         assert!((f64::from(lights.sources[i].probability) - expected[i]).abs() < 1e-7);
     }
     assert!(lights.sample(Vec3::new(0.0, 3.0, 0.0), 0, [1 << 31; 2]).is_none());
-    assert_eq!(lights.choose(Vec3::ZERO, u32::MAX).0.map(|c| c.source), Some(2));
+    assert_eq!(lights.choose(Vec3::ZERO, Facing::ANY, u32::MAX).0.map(|c| c.source), Some(2));
     assert_eq!(lights.pdf(11, Vec3::ZERO, 1.0, 1.0), 0.0);
 }
 

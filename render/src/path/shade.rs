@@ -5,6 +5,7 @@ use super::block::{Appearance, Block, Opaque};
 use super::interaction::{Interaction, triangle_place};
 use super::vertex::{Fate, cosine_direction, onwards, snap, survive, towards_light};
 use super::{Context, Contribution, Outcome, PathRay, ShadowRay, Surface, Surfaces, power_heuristic};
+use crate::light::Facing;
 use crate::material::{Blend, Bsdf, Look, Material, Relief, ReliefKind};
 use crate::math::{UnitDir, unit};
 use crate::ray::{Hit, PathKey, Ray};
@@ -357,10 +358,11 @@ pub(super) fn scatter_plain(
     let siblings = frame.split as f32;
 
     let place = [numbers[LIGHT], numbers[LIGHT + 1]];
+    let facing = if bsdf.transmits() { Facing::ANY } else { Facing::front(at.shading) };
     let sample_light = |from: Vec3, out: &mut Outcome| {
-        let (choice, fewer) = context.lights.choose(from, numbers[LIGHT_CHOICE]);
+        let (choice, fewer) = context.lights.choose(from, facing, numbers[LIGHT_CHOICE]);
         out.counters.chosen_of_fewer += u64::from(fewer);
-        context.lights.sample_chosen(choice?, from, place)
+        context.lights.sample_chosen(choice?, from, facing, place)
     };
     let blind = bsdf.is_delta() && skips.makes(Skip::Lobes);
     out.counters.lightless += u64::from(blind && seen);

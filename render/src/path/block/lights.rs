@@ -1,7 +1,9 @@
 //! Choosing lights and points on them.
 
 use super::{Block, N, set, set3};
-use crate::light::{Few, FewLight, FewShape, LightSample, Node, SphereLight, TriangleLight, end, probability};
+use crate::light::{
+    Facing, Few, FewLight, FewShape, LightSample, Node, SphereLight, TriangleLight, at_least, end, probability,
+};
 use crate::path::Context;
 use crate::path::vertex::select;
 
@@ -16,13 +18,17 @@ impl Block {
         for i in 0..self.len {
             self.is_ball[i] = false;
             // where a vertex passes there is no point to choose for
-            let (chosen, fewer) =
-                if self.passes[i] { (None, false) } else { context.lights.choose(self.origin.get(i), self.choice[i]) };
+            let facing = Facing::front(self.shading.get(i));
+            let (chosen, fewer) = if self.passes[i] {
+                (None, false)
+            } else {
+                context.lights.choose(self.origin.get(i), facing, self.choice[i])
+            };
             // what is seen from behind is black whatever shines there
             self.fewer += u64::from(fewer & self.seen[i]);
             self.chosen[i] = chosen;
             let Some(choice) = self.chosen[i] else { continue };
-            self.probability[i] = choice.probability;
+            (self.probability[i], self.worth[i]) = (choice.probability, choice.worth);
             let Some((triangle, radiance)) = context.lights.triangle(choice) else {
                 if let Some((sphere, radiance)) = context.lights.sphere(choice, self.origin.get(i)) {
                     self.is_ball[i] = true;
@@ -46,6 +52,7 @@ impl Block {
     #[inline(always)]
     fn choose_by_power(&mut self, few: &[FewLight]) {
         self.is_ball = [false; N];
+        self.worth = [1.0; N];
         for light in few {
             // bits all 1 where it is chosen: a select of floats would be unrolled into branches
             let mut mask = [0; N];
@@ -63,14 +70,17 @@ impl Block {
         const MOST: usize = 8;
         self.is_ball = [false; N];
         let few = &few[..few.len().min(MOST)];
-        let (mut sums, mut counts) = ([[0.0; N]; MOST], [[0; N]; MOST]);
-        let (mut all, mut count) = ([0.0; N], [0; N]);
+        let (mut sums, mut counts, mut importances) = ([[0.0; N]; MOST], [[0; N]; MOST], [[0.0; N]; MOST]);
+        let (mut all, mut facing, mut count) = ([0.0; N], [0.0; N], [0; N]);
         for k in 0..few.len() {
             for i in 0..N {
-                let importance = node.importance(k, self.origin.get(i));
+                let o = self.origin.get(i);
+                let importance = node.importance(k, o);
+                importances[k][i] = importance;
                 all[i] += importance;
+                facing[i] += importance * node.faces(k, o, Facing::front(self.shading.get(i)));
                 count[i] += u32::from(importance > 0.0);
-                (sums[k][i], counts[k][i]) = (all[i], count[i]);
+                (sums[k][i], counts[k][i]) = (facing[i], count[i]);
             }
         }
         let (mut fewer, most) = (0u32, few.len() as u32);
@@ -79,23 +89,30 @@ impl Block {
             fewer += u32::from((i < self.len) & is_fewer & self.seen[i] & !self.passes[i]);
         }
         self.fewer = u64::from(fewer);
-        let (mut begin, mut numbers) = ([0; N], [0; N]);
+        let (mut begin, mut numbers, mut importance) = ([0; N], [0; N], [0.0; N]);
         for (k, light) in few.iter().enumerate() {
             let mut mask = [0; N];
             for i in 0..N {
                 // where none shines there are no numbers to choose by
                 let length = if count[i] > 0 { 1 << 32 } else { 0 };
-                let end = end((sums[k][i], all[i]), (counts[k][i], count[i]), length);
+                let end = end((sums[k][i], facing[i]), (counts[k][i], count[i]), length);
                 let number = u64::from(self.choice[i]);
                 let is_chosen = (number >= begin[i]) & (number < end);
                 numbers[i] = if is_chosen { end - begin[i] } else { numbers[i] };
                 mask[i] = if is_chosen { u32::MAX } else { 0 };
                 begin[i] = end;
             }
+            for i in 0..N {
+                importance[i] = if mask[i] != 0 { importances[k][i] } else { importance[i] };
+            }
             self.take(light, &mask);
         }
         for i in 0..N {
-            self.probability[i] = probability(numbers[i]);
+            let truly = probability(numbers[i]);
+            let seen = at_least(importance[i] / all[i]);
+            // 0 where nothing was chosen
+            self.probability[i] = if truly > 0.0 { seen } else { 0.0 };
+            self.worth[i] = seen / truly;
         }
     }
 
@@ -135,7 +152,11 @@ impl Block {
                 area: self.light_area[i],
                 error: self.light_error[i],
             };
-            let (d, tmax, pdf, ok) = light.sample_or_not(self.origin.get(i), [self.place[0][i], self.place[1][i]]);
+            let o = self.origin.get(i);
+            let (place, warp) = light.warp(o, Facing::front(self.shading.get(i)), [self.place[0][i], self.place[1][i]]);
+            let worth = self.worth[i] * if self.is_ball[i] { 1.0 } else { warp };
+            self.arriving.set(i, self.radiance.get(i) * worth);
+            let (d, tmax, pdf, ok) = light.sample_or_not(o, place);
             self.light_d.set(i, d);
             self.light_tmax[i] = tmax;
             self.light_pdf[i] = pdf * self.probability[i];
@@ -188,7 +209,8 @@ impl Block {
                 continue;
             }
             let place = [self.place_bits[0][i], self.place_bits[1][i]];
-            let light = context.lights.sample_chosen(choice, self.origin.get(i), place);
+            let facing = Facing::front(self.shading.get(i));
+            let light = context.lights.sample_chosen(choice, self.origin.get(i), facing, place);
             self.take_light(context, i, light);
         }
         if count > 0 {
@@ -205,7 +227,7 @@ impl Block {
             self.light_d.set(i, light.d);
             self.light_tmax[i] = light.tmax;
             self.light_pdf[i] = light.pdf;
-            self.radiance.set(i, context.radiance(&light));
+            self.arriving.set(i, context.radiance(&light));
         }
     }
 }

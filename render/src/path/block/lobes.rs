@@ -188,7 +188,7 @@ impl Block {
             self.normal.get(i),
             self.shadow_d.get(i),
             self.light_pdf[i],
-            self.radiance.get(i),
+            self.arriving.get(i),
             self.lit[i] & self.seen[i],
         )
     }

@@ -148,7 +148,11 @@ pub(super) struct Block {
     light_center: Lanes3,
     light_radius: Lanes,
     probability: Lanes,
+    /// That over the true one.
+    worth: Lanes,
     radiance: Lanes3,
+    /// Radiance times the worth of the choice and of the place.
+    arriving: Lanes3,
     light_d: Lanes3,
     light_tmax: Lanes,
     light_pdf: Lanes,
@@ -251,7 +255,9 @@ impl Default for Block {
             light_center: Lanes3::ZERO,
             light_radius: lanes,
             probability: lanes,
+            worth: lanes,
             radiance: Lanes3::ZERO,
+            arriving: Lanes3::ZERO,
             light_d: Lanes3::ZERO,
             light_tmax: lanes,
             light_pdf: lanes,
@@ -438,7 +444,7 @@ impl Block {
                 self.light_d.get(i),
                 self.shadow_d.get(i),
                 self.light_pdf[i],
-                self.radiance.get(i),
+                self.arriving.get(i),
                 self.lit[i] & self.seen[i],
             );
             self.contribution.set(i, contribution);
