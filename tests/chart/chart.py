@@ -114,6 +114,14 @@ def always(r, values):
 def defaults(r, _):
     spec = r.one("Deployment", "rayherd-operator")["spec"]
     assert spec["replicas"] == 2 and spec["template"]["spec"]["serviceAccountName"] == "rayherd"
+    # above workers, and not both on one node
+    name = spec["template"]["spec"]["priorityClassName"]
+    own = r.one("PriorityClass", name)
+    assert own["value"] == 1000000 and own["globalDefault"] is False and str(own["value"]) in name, own
+    assert "preemptionPolicy" not in own, "it takes the place of what is less important"
+    (spread,) = spec["template"]["spec"]["topologySpreadConstraints"]
+    assert spread["whenUnsatisfiable"] == "DoNotSchedule" and spread["topologyKey"] == "kubernetes.io/hostname", spread
+    assert spread["labelSelector"]["matchLabels"] == spec["selector"]["matchLabels"], spread
     r.one("PodDisruptionBudget", "rayherd-operator")
     policies = r.kinds("NetworkPolicy")
     assert [p["metadata"]["name"] for p in policies] == ["rayherd-operator"], policies
@@ -137,6 +145,9 @@ def single(r, _):
 
 
 def namespaced(r, _):
+    # a class has no namespace: whoever installs makes it, as the cluster roles, and the operator has no right to it
+    assert len(r.kinds("PriorityClass")) == 1
+    assert not [g for d in r.kinds("Role") + r.kinds("ClusterRole") for g in grants(d) if "scheduling" in g[0]]
     cluster = r.kinds("ClusterRole")
     names = sorted(d["metadata"]["name"] for d in cluster)
     assert names == ["rayherd-editor", "rayherd-reviews", "rayherd-viewer"], names
@@ -194,9 +205,22 @@ def placed(r, _):
     assert pod["metadata"]["annotations"] == {"team": "render"}
     spec = pod["spec"]
     assert spec["nodeSelector"] == {"role": "infra"} and spec["priorityClassName"] == "high"
+    assert not r.kinds("PriorityClass"), "theirs is used"
     assert spec["tolerations"] == [{"key": "infra", "operator": "Exists"}]
     for what, pod in r.pods():
         assert pod["imagePullSecrets"] == [{"name": "one"}, {"name": "two"}], what
+
+
+def other_priority(r, _):
+    # another value is another object: a class's own cannot be changed by an upgrade
+    (own,) = r.kinds("PriorityClass")
+    assert own["value"] == -5 and own["metadata"]["name"] == "rayherd-operator-minus-5", own
+    assert r.one("Deployment", "rayherd-operator")["spec"]["template"]["spec"]["priorityClassName"] == own["metadata"]["name"]
+
+
+def no_priority(r, _):
+    assert not r.kinds("PriorityClass")
+    assert "priorityClassName" not in r.one("Deployment", "rayherd-operator")["spec"]["template"]["spec"]
 
 
 def monitoring(r, _):
@@ -301,6 +325,8 @@ SETS = {
         },
         placed,
     ),
+    "another priority": ({"priority": -5}, other_priority),
+    "no priority": ({"priority": 0}, no_priority),
     "monitoring": ({"monitoring.enabled": "true", "monitoring.labels.release": "prometheus"}, monitoring),
     "no trial": ({"trial.enabled": "false"}, no_trial),
     "minio": (MINIO, minio),
@@ -317,6 +343,8 @@ REFUSED = [
     ({"replicas": "none"}, "replicas"),
     ({"replicas": 0}, "replicas"),
     ({"sceneDays": -1}, "sceneDays"),
+    ({"priority": 2000000000}, "priority"),
+    ({"priority": "high"}, "priority"),
     ({"imagePullPolicy": "Sometimes"}, "imagePullPolicy"),
     ({"imagee": "x"}, "imagee"),
     ({"storage.default.bucket": "x"}, "bucket"),
