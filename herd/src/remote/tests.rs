@@ -285,6 +285,20 @@ fn depot(stores: &[Arc<Faulty>], home: Option<u32>) -> Depot {
     Depot::watched(stores.iter().map(watched).collect(), home).unwrap()
 }
 
+/// A worker of this version on a node without a store asks for work, no stage open.
+pub(super) fn poll(number: u32, session: &str) -> Poll {
+    Poll {
+        worker: WorkerId { number, session: session.into() },
+        home: None,
+        stage: None,
+        clerk: false,
+        bands: true,
+        aovs: true,
+        builds: true,
+        holds: None,
+    }
+}
+
 fn wait_for(what: impl Fn() -> bool) {
     let since = Instant::now();
     while !what() {
@@ -354,17 +368,8 @@ fn a_job_without_workers_keeps_no_other_from_preparing_their_scene() {
         let depot = &depot;
         let waits = scope.spawn(move || run(&cluster.job(spec, depot, first, "f"), &keeper, &Silent));
         // nor one whose worker was there, and is gone with the work in its hands
-        let gone = WorkerId { number: 0, session: "gone".into() };
-        let poll = Poll {
-            worker: gone.clone(),
-            home: None,
-            stage: None,
-            clerk: false,
-            bands: true,
-            aovs: true,
-            builds: true,
-            holds: None,
-        };
+        let poll = poll(0, "gone");
+        let gone = poll.worker.clone();
         wait_for(|| matches!(first.answer(&poll), Ok(Answer::Work { .. })));
         first.gone(&gone);
         cluster.render(spec, &kept).unwrap();
@@ -507,19 +512,9 @@ fn a_film_that_was_stored_in_other_parts_goes_on() {
 #[test]
 fn a_worker_that_comes_back_under_another_session_loses_only_its_tasks() {
     let fleet = Fleet::new(1, "e");
-    let poll = |session: &str| Poll {
-        worker: WorkerId { number: 0, session: session.into() },
-        home: None,
-        stage: None,
-        clerk: false,
-        bands: true,
-        aovs: true,
-        builds: true,
-        holds: None,
-    };
+    let poll = |session: &str| poll(0, session);
     assert_eq!(fleet.answer(&poll("a")), Ok(Answer::Wait));
-    let stranger = Poll { worker: WorkerId { number: 1, session: "a".into() }, ..poll("a") };
-    assert!(fleet.answer(&stranger).is_err());
+    assert!(fleet.answer(&super::tests::poll(1, "a")).is_err());
     std::thread::scope(|scope| {
         let work = super::Work::Merge { name: None, parts: vec![], spp: 1, picture: None, band: None };
         let call = scope.spawn(|| fleet.call(work));
@@ -578,18 +573,7 @@ fn a_worker_that_comes_back_under_another_session_loses_only_its_tasks() {
 fn a_worker_that_knows_no_bands_is_given_none() {
     let fleet = Fleet::new(2, "e");
     let poll = |number: u32, bands: bool| {
-        let worker = WorkerId { number, session: "a".into() };
-        let text = serde_json::to_value(Poll {
-            worker,
-            home: None,
-            stage: None,
-            clerk: false,
-            bands,
-            aovs: true,
-            builds: true,
-            holds: None,
-        })
-        .unwrap();
+        let text = serde_json::to_value(Poll { bands, ..poll(number, "a") }).unwrap();
         // as it is written where the word is not known
         let serde_json::Value::Object(mut map) = text else { unreachable!() };
         if !bands {
@@ -833,9 +817,7 @@ fn a_job_whose_scene_is_known_needs_its_source_no_more() {
 fn workers_that_wait_are_sent_to_the_next_fleet_at_once() {
     let runtime = Runtime::new().unwrap();
     let fleet = Fleet::new(1, "e");
-    let worker = WorkerId { number: 0, session: "a".into() };
-    let poll =
-        Poll { worker, home: None, stage: None, clerk: false, bands: true, aovs: true, builds: true, holds: None };
+    let poll = poll(0, "a");
     // far longer than a test may take
     let waits = runtime.block_on(async {
         let waiting = fleet.poll(&poll, Duration::from_secs(3600));
@@ -857,17 +839,7 @@ impl Hand<'_> {
         let (mut stage, mut memory) = (None, None);
         let since = Instant::now();
         loop {
-            let worker = WorkerId { number: 0, session: session.into() };
-            let poll = Poll {
-                worker,
-                home: None,
-                stage: stage.clone(),
-                clerk: false,
-                bands: true,
-                aovs: true,
-                builds: true,
-                holds: None,
-            };
+            let poll = Poll { stage: stage.clone(), ..poll(0, session) };
             match self.0.answer(&poll).unwrap() {
                 Answer::Open { stage: now } => (memory, stage) = now.map_or((None, None), |s| (s.memory, Some(s.id))),
                 Answer::Work { work, .. } => return (memory, *work),

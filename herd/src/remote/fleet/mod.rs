@@ -485,7 +485,7 @@ impl Executor for Fleet {
         match state.workers.get_mut(node).and_then(|w| w.as_mut()) {
             Some(worker) => worker.ready.push_back((task, number, Work::Attempt { attempt }, stop)),
             // it went away since it was planned for
-            None => state.lose(task, number),
+            None => state.give_back(task, number),
         }
         drop(state);
         self.tell();

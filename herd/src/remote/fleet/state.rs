@@ -122,7 +122,7 @@ impl State {
                 std::mem::take(&mut w.ready)
             })
             .collect();
-        ready.into_iter().for_each(|(task, number, ..)| self.lose(task, number));
+        ready.into_iter().for_each(|(task, number, ..)| self.give_back(task, number));
         self.emptied.clear();
     }
 
@@ -180,7 +180,7 @@ impl State {
         Ok(newcomer)
     }
 
-    /// A worker is gone: what it did is lost, what any worker can do is done by another. Whether it was there.
+    /// A worker is gone: what it did is lost, what it had not begun goes back, what any worker can do is done by another. Whether it was there.
     pub fn leave(&mut self, number: u32) -> bool {
         let Some(worker) = self.workers.get_mut(number as usize).and_then(Option::take) else { return false };
         if let Some(tally) = self.by_worker.get_mut(&number) {
@@ -190,7 +190,7 @@ impl State {
         let held = self.doing.values().filter(|d| d.worker == number).map(|d| d.held.clone()).collect();
         self.deaths.left(number, &worker.session, held);
         for (task, attempt, _, _) in worker.ready {
-            self.lose(task, attempt);
+            self.give_back(task, attempt);
         }
         let ids: Vec<String> =
             self.doing.iter().filter(|(_, d)| d.worker == number).map(|(id, _)| id.clone()).collect();
@@ -222,8 +222,14 @@ impl State {
         }
     }
 
-    pub fn lose(&mut self, task: TaskId, number: u32) {
+    /// An attempt that was begun is gone with the work in it.
+    fn lose(&mut self, task: TaskId, number: u32) {
         *self.outcomes.entry(Outcome::Gone).or_default() += 1;
+        self.give_back(task, number);
+    }
+
+    /// What an attempt was to do is planned anew: one that nobody has begun is no work lost, and is not counted as that.
+    pub fn give_back(&mut self, task: TaskId, number: u32) {
         let (result, bytes) = (Err(JobError::Stopped), Bytes::default());
         self.finished.push_back(Finished { task, number, result, cpu: 0.0, bytes });
     }

@@ -13,7 +13,7 @@ pub enum Outcome {
     Made,
     /// It was given back, or another one had done the task.
     Stopped,
-    /// Its worker went away.
+    /// Its worker, which had begun it, went away.
     Gone,
     /// What it was to work on was lost.
     Lost,

@@ -1,22 +1,71 @@
 //! Work that is handed out and reported, by hand.
 
+use std::collections::BTreeMap;
+
 use super::*;
+use crate::ledger::TaskId;
+use crate::local::attempt::Attempt;
+use crate::local::slots::StopFlag;
+use crate::plan::Set;
+use crate::remote::tests::poll;
+
+fn report(worker: &WorkerId, id: &str, result: Result<Done, Failure>) -> Report {
+    Report {
+        worker: worker.clone(),
+        id: id.to_owned(),
+        result,
+        cpu: 0.0,
+        bytes: Vec::new(),
+        reads: Default::default(),
+        holds: None,
+        cache_failures: 0,
+        resident: 0,
+    }
+}
+
+fn given(answer: Answer) -> Option<(String, Work)> {
+    match answer {
+        Answer::Work { id, work } => Some((id, *work)),
+        _ => None,
+    }
+}
+
+/// Both are planned anew, but only what was begun is counted as lost.
+#[test]
+fn attempts_that_a_dead_worker_had_begun_are_lost_and_those_that_it_had_not_are_none() {
+    let fleet = Fleet::new(1, "e");
+    let launch = |task| {
+        let attempt = Attempt { name: "a".into(), node: 0, set: Set::Reduce, groups: Vec::new(), camera: Vec::new() };
+        fleet.launch(Launch { task: TaskId(task), number: 0, attempt, stop: StopFlag::default() });
+    };
+    // planned for a worker that went before it was told
+    launch(0);
+    let poll = poll(0, "s");
+    assert_eq!(fleet.answer(&poll), Ok(Answer::Wait));
+    (1..6).for_each(launch);
+    let begun: Vec<String> = (0..3).filter_map(|_| Some(given(fleet.answer(&poll).unwrap())?.0)).collect();
+    assert_eq!(begun.len(), 3);
+    // one is given back in time
+    assert_eq!(fleet.report(report(&poll.worker, &begun[1], Err(Failure::Stopped))), Ok(true));
+    fleet.gone(&poll.worker);
+    let mut back = Vec::new();
+    while let Some(event) = fleet.next(Duration::ZERO).unwrap() {
+        if let Event::Finished(finished) = event {
+            assert!(matches!(finished.result, Err(JobError::Stopped)));
+            back.push(finished.task.0);
+        }
+    }
+    back.sort_unstable();
+    assert_eq!(back, [0, 1, 2, 3, 4, 5], "all are planned anew");
+    assert_eq!(fleet.tally().outcomes, BTreeMap::from([(Outcome::Gone, 2), (Outcome::Stopped, 1)]));
+}
 
 /// As a link does that is cut for less than a worker is silent for.
 #[test]
 fn work_whose_answer_was_lost_on_its_way_is_given_out_again() {
     let fleet = Fleet::new(1, "e");
-    let worker = WorkerId { number: 0, session: "s".into() };
-    let poll = Poll {
-        worker: worker.clone(),
-        home: None,
-        stage: None,
-        clerk: true,
-        bands: true,
-        aovs: true,
-        builds: false,
-        holds: None,
-    };
+    let poll = Poll { clerk: true, ..poll(0, "s") };
+    let worker = &poll.worker;
     let given = || loop {
         if let Answer::Work { id, .. } = fleet.answer(&poll).unwrap() {
             return id;
@@ -32,17 +81,7 @@ fn work_whose_answer_was_lost_on_its_way_is_given_out_again() {
         assert!(fleet.lock().take_back(&beat(&[]), Duration::ZERO));
         let second = given();
         let done = Done::Restored { copies: 1, few: 0 };
-        let report = |id: &str| Report {
-            worker: worker.clone(),
-            id: id.to_owned(),
-            result: Ok(done.clone()),
-            cpu: 0.0,
-            bytes: Vec::new(),
-            reads: Default::default(),
-            holds: None,
-            cache_failures: 0,
-            resident: 0,
-        };
+        let report = |id: &str| report(worker, id, Ok(done.clone()));
         assert!(!fleet.report(report(&first)).unwrap(), "it is another's now");
         assert!(fleet.report(report(&second)).unwrap());
         assert_eq!(call.join().unwrap().unwrap(), done);

@@ -212,9 +212,7 @@ fn a_scene_for_one_worker_and_a_small_one_are_prepared_by_one() {
 fn a_worker_that_knows_no_blocks_is_given_none_and_others_build_those_of_their_store_first() {
     let fleet = Fleet::new(3, "e");
     let given = |number: u32, home: u32, builds: bool, clerk: bool| {
-        let worker = WorkerId { number, session: "a".into() };
-        let (stage, holds, home) = (None, None, Some(home));
-        let poll = Poll { worker, home, stage, clerk, bands: true, aovs: true, builds, holds };
+        let poll = Poll { home: Some(home), clerk, builds, ..poll(number, "a") };
         let mut text = serde_json::to_value(poll).unwrap();
         if !builds {
             text.as_object_mut().unwrap().remove("builds");
@@ -365,17 +363,7 @@ fn a_source_is_known_by_its_listing_until_it_changes_or_something_of_the_scene_i
 fn a_source_is_cut_beside_it_if_a_worker_is_there() {
     let fleet = Fleet::new(2, "e");
     let given = |number: u32, home: u32| {
-        let worker = WorkerId { number, session: "a".into() };
-        let poll = Poll {
-            worker,
-            home: Some(home),
-            stage: None,
-            clerk: false,
-            bands: true,
-            aovs: true,
-            builds: true,
-            holds: None,
-        };
+        let poll = Poll { home: Some(home), ..poll(number, "a") };
         matches!(fleet.answer(&poll).unwrap(), Answer::Work { .. })
     };
     let cut =

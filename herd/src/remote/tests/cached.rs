@@ -253,22 +253,9 @@ fn of_what_a_cache_holds_the_latest_word_counts() {
         };
         fleet.open(stage, vec![vec![0]; 4], 0);
     };
-    let worker = || WorkerId { number: 0, session: "a".into() };
     let holds = |version: u64, runs: &[[u32; 2]]| Some(Holds { version, splits: runs.to_vec() });
     let say = |stage: &str, holds: Option<Holds>| {
-        let (stage, home) = (Some(stage.into()), None);
-        fleet
-            .answer(&over(&Poll {
-                worker: worker(),
-                home,
-                stage,
-                clerk: false,
-                bands: true,
-                aovs: true,
-                builds: true,
-                holds,
-            }))
-            .unwrap()
+        fleet.answer(&over(&Poll { stage: Some(stage.into()), holds, ..poll(0, "a") })).unwrap()
     };
     let held = || fleet.holders().unwrap().iter().map(|on| !on.is_empty()).collect::<Vec<_>>();
     open("one");
