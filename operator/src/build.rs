@@ -79,7 +79,23 @@ pub fn same_workers(old: &RenderJobSpec, new: &RenderJobSpec) -> bool {
         && (a.memory, &a.template, &old.storage, old.placement) == (b.memory, &b.template, &new.storage, new.placement)
 }
 
-/// The pod of a worker, as JSON. `held` are the scene's bytes by node, `trusted` the certificates that the operator is known by.
+/// Where lies what a job works on: bytes by node.
+#[derive(Clone, Debug, Default)]
+pub struct Lies {
+    /// Its scene's blocks, once that is known.
+    pub scene: BTreeMap<String, u64>,
+    /// Its source, which somebody is to read before.
+    pub source: BTreeMap<String, u64>,
+}
+
+impl Lies {
+    /// What a worker that comes now is to be beside.
+    fn nearest(&self) -> &BTreeMap<String, u64> {
+        if self.scene.is_empty() { &self.source } else { &self.scene }
+    }
+}
+
+/// The pod of a worker, as JSON. `trusted` are the certificates that the operator is known by.
 ///
 /// What the job's template says comes on top of ours, but for what makes the pod a worker: its name, its owner, its labels, its token
 /// and its settings.
@@ -90,7 +106,7 @@ pub fn pod(
     job: &RenderJobObject,
     config: &Config,
     storage: &Storage,
-    held: &BTreeMap<String, u64>,
+    lies: &Lies,
     trusted: &str,
     number: u32,
     name: &str,
@@ -132,7 +148,7 @@ pub fn pod(
             "enableServiceLinks": false,
             "serviceAccountName": storage.service_account,
             "terminationGracePeriodSeconds": GRACE_SECONDS,
-            "affinity": affinity(&uid, held, job.spec.placement),
+            "affinity": affinity(&uid, lies.nearest(), job.spec.placement),
             "securityContext": {
                 "runAsNonRoot": true,
                 "runAsUser": 65532,
@@ -168,7 +184,7 @@ pub fn pod(
         false => json!([{"secretRef": {"name": secret_name(&job.spec.storage)}}]),
     };
     if job.spec.placement == Placement::Required {
-        bind(&mut pod, &holders(held));
+        bind(&mut pod, &holders(&lies.scene));
     }
     let ours = json!({
         "apiVersion": "v1",
@@ -179,7 +195,7 @@ pub fn pod(
             "labels": {
                 LABEL: uid,
                 NUMBER: number.to_string(),
-                PLACED: (!held.is_empty()).to_string(),
+                PLACED: (!lies.scene.is_empty()).to_string(),
                 "app.kubernetes.io/name": "rayherd-worker",
                 "app.kubernetes.io/managed-by": "rayherd-operator",
             },
@@ -247,7 +263,7 @@ fn merge(base: &mut Value, top: &Value) {
     }
 }
 
-/// Nodes are preferred by the bytes that they hold, and one worker to a node before two.
+/// Nodes are preferred by the bytes that they hold of what is worked on, and one worker to a node before two.
 fn affinity(uid: &str, held: &BTreeMap<String, u64>, placement: Placement) -> Value {
     let most = held.values().copied().max().unwrap_or(0);
     let weight = |bytes: u64| (u128::from(bytes) * 100).div_ceil(u128::from(most.max(1))).clamp(1, 100) as u64;
@@ -433,8 +449,9 @@ mod tests {
             ..Storage::default()
         };
         let held = BTreeMap::from([("node1".to_owned(), 1000), ("node2".to_owned(), 1), ("node3".to_owned(), 0)]);
+        let lies = Lies { scene: held, source: BTreeMap::from([("node9".to_owned(), 5000)]) };
         let pod: Pod =
-            serde_json::from_value(pod(&job(), &config(), &storage, &held, "PEM", 1, "box-w1").unwrap()).unwrap();
+            serde_json::from_value(pod(&job(), &config(), &storage, &lies, "PEM", 1, "box-w1").unwrap()).unwrap();
         let spec = pod.spec.unwrap();
         assert_eq!(spec.automount_service_account_token, Some(false));
         let container = &spec.containers[0];
@@ -454,10 +471,30 @@ mod tests {
     }
 
     #[test]
+    fn who_prepares_is_drawn_to_the_source_and_bound_to_nothing() {
+        let storage = Storage { bucket: "b".into(), region: "r".into(), ..Storage::default() };
+        let source = [("node1".to_owned(), 0), ("node2".to_owned(), 70)].into();
+        let lies = Lies { source, ..Lies::default() };
+        let nodes = "/spec/affinity/nodeAffinity/preferredDuringSchedulingIgnoredDuringExecution";
+        let value = "/0/preference/matchExpressions/0/values";
+        for placement in [Placement::Preferred, Placement::Required, Placement::None] {
+            let mut job = job();
+            job.spec.placement = placement;
+            let made = pod(&job, &config(), &storage, &lies, "PEM", 0, "box-w0").unwrap();
+            let found = made.pointer(&format!("{nodes}{value}"));
+            assert_eq!(found, (placement != Placement::None).then(|| json!(["node2"])).as_ref(), "{placement:?}");
+            assert!(made.pointer(&format!("{nodes}/1")).is_none());
+            assert!(!made.to_string().contains("nodeSelectorTerms"), "where its blocks will lie is not known");
+            // so it may be made anew there, when that is known
+            assert_eq!(made["metadata"]["labels"][PLACED], json!("false"));
+        }
+    }
+
+    #[test]
     fn a_template_comes_on_top_but_a_worker_stays_one() {
         let storage = Storage { bucket: "b".into(), region: "r".into(), ..Storage::default() };
-        let held = BTreeMap::from([("node1".to_owned(), 1000)]);
-        let made = |job: &RenderJobObject| pod(job, &config(), &storage, &held, "PEM", 1, "box-w1").unwrap();
+        let lies = Lies { scene: BTreeMap::from([("node1".to_owned(), 1000)]), ..Lies::default() };
+        let made = |job: &RenderJobObject| pod(job, &config(), &storage, &lies, "PEM", 1, "box-w1").unwrap();
         let mut with = job();
         with.spec.workers.template = Some(json!({
             "metadata": {"name": "mine", "labels": {"team": "a", LABEL: "other"}, "ownerReferences": [{"name": "x"}]},
@@ -539,7 +576,7 @@ mod tests {
     #[test]
     fn a_worker_with_an_identity_has_an_account_and_no_keys() {
         let made = |storage: &Storage| {
-            let pod = pod(&job(), &config(), storage, &BTreeMap::new(), "PEM", 0, "box-w0").unwrap();
+            let pod = pod(&job(), &config(), storage, &Lies::default(), "PEM", 0, "box-w0").unwrap();
             let spec = serde_json::from_value::<Pod>(pod).unwrap().spec.unwrap();
             (spec.service_account_name, spec.containers[0].env_from.clone().unwrap_or_default().len())
         };
@@ -560,7 +597,7 @@ mod tests {
                 {"name": "MINE", "value": "1"},
             ]}],
         }}));
-        let made = pod(&with, &config(), &storage, &BTreeMap::new(), "PEM", 0, "box-w0").unwrap();
+        let made = pod(&with, &config(), &storage, &Lies::default(), "PEM", 0, "box-w0").unwrap();
         let of = |list: &str, name: &str| {
             let all = made.pointer(list).unwrap().as_array().unwrap().iter();
             all.filter(|v| v["name"] == name).cloned().collect::<Vec<_>>()
@@ -611,7 +648,7 @@ mod tests {
         let without = Storage { bucket: "b".into(), region: "r".into(), endpoints, ..Storage::default() };
         let with = Storage { cache: 20 << 30, ..without.clone() };
         let made =
-            |job: &RenderJobObject, storage| pod(job, &config(), storage, &BTreeMap::new(), "PEM", 0, "a").unwrap();
+            |job: &RenderJobObject, storage| pod(job, &config(), storage, &Lies::default(), "PEM", 0, "a").unwrap();
         let (plain, cached) = (made(&job(), &without), made(&job(), &with));
         let at = |pod: &Value, path: &str| pod.pointer(path).cloned().unwrap_or_default();
         let env = |pod: &Value, name: &str| {
@@ -694,7 +731,7 @@ mod tests {
         let pods =
             [there("a-w0", "0", "worker:0"), there("a-w1", "1", "worker:0"), there("a-w2", "2", "worker:1"), going];
         let storage = Storage { bucket: "b".into(), region: "r".into(), ..Storage::default() };
-        let made = pod(&job(), &config(), &storage, &BTreeMap::new(), "PEM", 0, "a").unwrap();
+        let made = pod(&job(), &config(), &storage, &Lies::default(), "PEM", 0, "a").unwrap();
         // another one of that image would be no better, and one that can do it stays
         assert_eq!(outdated(&pods, &[0, 2, 3], &made), ["a-w0"]);
         assert_eq!(outdated(&pods, &[], &made), [""; 0]);

@@ -73,6 +73,8 @@ pub struct State {
     pub below: Option<String>,
     /// The scene's bytes by node.
     pub held: BTreeMap<String, u64>,
+    /// The source's, when its scene is known not to be prepared yet.
+    pub source: Option<BTreeMap<String, u64>>,
     /// Of the current frame.
     pub status: Status,
     /// Of the frames that are done.

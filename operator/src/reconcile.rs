@@ -1,6 +1,6 @@
 //! One step towards what a RenderJob asks for: look, decide, apply, tell.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeSet;
 use std::sync::{Arc, PoisonError, RwLock};
 use std::time::{Duration, Instant};
 
@@ -17,13 +17,13 @@ use kube::runtime::controller::Action;
 use kube::runtime::events::{Event, EventType, Recorder, Reporter};
 use kube::{Api, Client, Resource, ResourceExt};
 use rayherd_api::resource::{RenderJobObject, RenderJobStatus};
-use rayherd_api::{MANAGED_BY, RenderJobSpec, validate};
+use rayherd_api::{MANAGED_BY, Placement, RenderJobSpec, validate};
 use rayherd_herd::remote::{Storage, Turns};
 use rayherd_herd::store::StoreError;
 use serde_json::json;
 
 use crate::backoff::Failures;
-use crate::build;
+use crate::build::{self, Lies};
 use crate::config::Config;
 use crate::finish::{self, Leftovers};
 use crate::jobs::{Jobs, Running, State};
@@ -45,6 +45,10 @@ const LOOK: Duration = Duration::from_secs(1);
 const SOON: Duration = Duration::from_millis(200);
 /// A known scene is found within this time, or prepared again.
 const LOOK_UP: SignedDuration = SignedDuration::from_secs(5);
+/// Workers are put beside the job's scene, and whoever is to prepare it beside its source, if it is known where that lies within this time after the
+/// job began: it takes a few requests to each server, and longer only where one hangs.
+const SOUGHT: SignedDuration = SignedDuration::from_secs(2);
+const SEEKING: Duration = Duration::from_millis(10);
 /// A pod that is to end is taken for ended so long after its grace period, when its node does not say: it may be gone for good.
 const SILENT: SignedDuration = SignedDuration::from_secs(30);
 /// After the first failure of a job, before it is looked at again.
@@ -409,22 +413,26 @@ async fn keep_pods(
 ) -> Result<(), Error> {
     let pods: Api<Pod> = Api::namespaced(context.client.clone(), namespace);
     let found = list_pods(&pods, uid).await?;
+    if running.is_local() && job.spec.placement != Placement::None {
+        sought(running).await;
+    }
     let killed = newly_killed(&mut running.lock(), kills(&found));
     for kill in killed {
         running.fleet.killed_for_memory(kill.number, kill.limit.as_deref());
     }
-    let (held, placed, waits) = {
+    let (lies, placed, waits) = {
         let state = running.lock();
         // a known scene is looked up at once: workers of an earlier run must not go for that moment
         let fresh = state.started.is_some_and(|t| Timestamp::now().duration_since(t) < LOOK_UP);
-        (state.held.clone(), state.cut || state.scene.is_some(), state.known && fresh)
+        let lies = Lies { scene: state.held.clone(), source: state.source.clone().unwrap_or_default() };
+        (lies, state.cut || state.scene.is_some(), state.known && fresh)
     };
     // until it is known where the scene's blocks are, or are to be, one worker prepares it
     let wanted = if placed { follow(job, running) } else { 1 };
     let mut plan = if waits && !placed {
         build::Plan::default()
     } else {
-        build::plan(&job.name_any(), &found, wanted, (&held, job.spec.placement))
+        build::plan(&job.name_any(), &found, wanted, (&lies.scene, job.spec.placement))
     };
     {
         let (mut state, now) = (running.lock(), Timestamp::now());
@@ -454,7 +462,7 @@ async fn keep_pods(
     let trusted = context.trusted.read().unwrap_or_else(PoisonError::into_inner).clone();
     let unfit = running.fleet.unfit();
     if let Some(&first) = unfit.first() {
-        let made = build::pod(job, &context.config, &running.storage(), &held, &trusted, first, "");
+        let made = build::pod(job, &context.config, &running.storage(), &lies, &trusted, first, "");
         let made = made.map_err(|e| Error::Internal(e.to_string()))?;
         for name in build::outdated(&found, &unfit, &made) {
             tracing::info!(pod = name, "a worker of another version cannot do the job: another takes its place");
@@ -470,7 +478,7 @@ async fn keep_pods(
     }
     let storage = running.storage();
     for (number, name) in &plan.make {
-        let pod = build::pod(job, &context.config, &storage, &held, &trusted, *number, name)
+        let pod = build::pod(job, &context.config, &storage, &lies, &trusted, *number, name)
             .map_err(|e| Error::Internal(e.to_string()))?;
         let params = PatchParams::apply(MANAGER);
         match given.patch(name, &params, &Patch::Apply(&pod)).await {
@@ -490,6 +498,18 @@ async fn keep_pods(
         }
     }
     Ok(())
+}
+
+/// Waits a moment until it is known where the job's scene lies, or its source: workers are not to come up elsewhere.
+async fn sought(running: &Running) {
+    let is_known = || {
+        let state = running.lock();
+        let late = state.started.is_none_or(|t| Timestamp::now().duration_since(t) >= SOUGHT);
+        late || state.source.is_some() || !state.held.is_empty() || state.end.is_some()
+    };
+    while !is_known() {
+        tokio::time::sleep(SEEKING).await;
+    }
 }
 
 /// Looks again where servers are that were away when the job began: a worker beside one is to know it.
@@ -537,7 +557,7 @@ fn pods_as_given(context: &Context, namespace: &str) -> Api<DynamicObject> {
 async fn try_pod(job: &RenderJobObject, context: &Context, namespace: &str, storage: &Storage) -> Result<(), Error> {
     // a name that none of ours has: nothing is made
     let name = format!("{}-template", job.name_any());
-    let pod = build::pod(job, &context.config, storage, &BTreeMap::new(), "", 0, &name);
+    let pod = build::pod(job, &context.config, storage, &Lies::default(), "", 0, &name);
     let pod = pod.map_err(|e| Error::Internal(e.to_string()))?;
     let params = PatchParams { field_validation: Some(ValidationDirective::Strict), ..PatchParams::apply(MANAGER) };
     match pods_as_given(context, namespace).patch(&name, &params.dry_run().force(), &Patch::Apply(&pod)).await {

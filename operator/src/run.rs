@@ -1,5 +1,6 @@
 //! A job's thread: runs the loop over rounds, and tells how far it is.
 
+use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::thread;
 use std::time::Duration;
@@ -163,21 +164,33 @@ impl Keeper for Kept {
         self.placed(bytes);
         self.running.lock().cut = true;
     }
+    fn source(&self, bytes: &[u64]) {
+        let by_node = self.by_node(bytes);
+        self.running.lock().source = Some(by_node);
+    }
     fn below(&self, what: Option<&str>) {
         self.running.lock().below = what.map(str::to_owned);
     }
     fn placed(&self, bytes: &[u64]) {
-        let mut state = self.running.lock();
-        state.held.clear();
-        for (endpoint, bytes) in self.running.storage().endpoints.iter().zip(bytes) {
-            if let Some(node) = &endpoint.node {
-                *state.held.entry(node.clone()).or_default() += bytes;
-            }
-        }
+        let by_node = self.by_node(bytes);
+        self.running.lock().held = by_node;
     }
     fn done(&self, _: u32, picture: &[String], report: &Report) {
         // one address of each picture is enough
         self.running.lock().done(picture.first().cloned(), report.clone());
+    }
+}
+
+impl Kept {
+    /// Bytes by store as bytes by node, as far as nodes are known.
+    fn by_node(&self, bytes: &[u64]) -> BTreeMap<String, u64> {
+        let mut all = BTreeMap::new();
+        for (endpoint, bytes) in self.running.storage().endpoints.iter().zip(bytes) {
+            if let Some(node) = &endpoint.node {
+                *all.entry(node.clone()).or_default() += bytes;
+            }
+        }
+        all
     }
 }
 

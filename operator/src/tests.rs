@@ -11,6 +11,7 @@ use kube::runtime::controller::Action;
 use rayherd_api::resource::RenderJobObject;
 use rayherd_herd::job::JobError;
 use rayherd_herd::remote::Depot;
+use rayherd_herd::store::s3_server::{BUCKET, S3Server};
 use rayherd_herd::store::{BlockStore, MemoryStore};
 use serde_json::{Value, json};
 use tokio::runtime::Handle;
@@ -249,6 +250,36 @@ fn begins(pods: Value) -> Vec<Step> {
         step("PATCH", JOB, 200, with_finalizer),
         step("GET", PODS, 200, pods),
     ]
+}
+
+#[tokio::test]
+async fn the_first_worker_comes_up_beside_the_source() {
+    let servers = [S3Server::start().await, S3Server::start().await];
+    servers[1].put_raw("scenes/box/box.xml", b"<scene version='3.0.0'/>");
+    let url = |n: usize| servers[n].settings("").endpoint.unwrap();
+    let profile = format!(
+        "bucket: {BUCKET}\nendpoints: [{{url: '{}', node: node1}}, {{url: '{}', node: node2}}]",
+        url(0),
+        url(1)
+    );
+    let profile = json!({"metadata": {"name": "rayherd-storage-default"}, "data": {"profile.yaml": profile}});
+    let pod = json!({"metadata": {"name": "box-w0", "uid": "p-0", "labels": {"rayherd.io/worker": "0"}}});
+    let mut steps = begins(no_pods());
+    steps[0] = step("GET", PROFILE, 200, profile);
+    // test-key, test-secret
+    steps[1].answer["data"] = json!({"AWS_ACCESS_KEY_ID": "dGVzdC1rZXk=", "AWS_SECRET_ACCESS_KEY": "dGVzdC1zZWNyZXQ="});
+    let nodes = "/spec/affinity/nodeAffinity/preferredDuringSchedulingIgnoredDuringExecution";
+    steps.extend([
+        step("PATCH", "/api/v1/namespaces/studio/pods/box-w0?", 201, pod)
+            .with("/metadata/labels/rayherd.io~1placed", json!("false")),
+        step("PATCH", STATUS, 200, job()).with("/status/phase", json!("Pending")),
+    ]);
+    let (done, said, context) = scenario(&job(), steps).await;
+    assert_ne!(done.unwrap(), Action::await_change());
+    let terms = said[4].pointer(nodes).and_then(Value::as_array).expect("node affinity").clone();
+    assert_eq!(terms.len(), 1, "{terms:?}");
+    assert_eq!(terms[0].pointer("/preference/matchExpressions/0/values"), Some(&json!(["node2"])));
+    context.jobs.get("u-1").expect("it runs").fleet.cancel("the test is over");
 }
 
 #[tokio::test]

@@ -45,6 +45,9 @@ pub trait Keeper: Send + Sync {
     fn cut(&self, bytes: &[u64]) {
         self.placed(bytes);
     }
+    /// No scene is known that was prepared from the source, which lies on the stores so: bytes by store, nothing where that is not known. A worker is
+    /// about to be asked.
+    fn source(&self, _bytes: &[u64]) {}
     /// The scene is prepared.
     fn prepared(&self, scene: &ObjectRef, reused: bool);
     /// Which nodes' stores hold the scene: bytes by store.

@@ -45,9 +45,14 @@ impl Listing {
         stores.iter().any(|s| !s.is_empty()).then_some(Listing { stores })
     }
 
+    /// Bytes of it by store.
+    pub fn bytes(&self) -> Vec<u64> {
+        self.stores.iter().map(|s| s.iter().map(|v| v.bytes).sum()).collect()
+    }
+
     /// Stores that hold most of it.
     pub fn holders(&self) -> Vec<u32> {
-        let bytes: Vec<u64> = self.stores.iter().map(|s| s.iter().map(|v| v.bytes).sum()).collect();
+        let bytes = self.bytes();
         let most = bytes.iter().copied().max().unwrap_or(0);
         (0..).zip(bytes).filter(|&(_, b)| most > 0 && b == most).map(|(n, _)| n).collect()
     }

@@ -39,6 +39,7 @@ pub fn prepared(job: &Job, keeper: &dyn Keeper, replicas: u32) -> Result<Scene, 
     if let Some(reference) = name.as_ref().and_then(|name| listing::find(job, replicas, name)) {
         return Ok((reference, true, 0));
     }
+    keeper.source(&listing.as_ref().map(Listing::bytes).unwrap_or_default());
     let prefix = format!("{}/prepare", job.prefix);
     let apart = (job.slots.len() > 1).then(|| Apart { prefix: prefix.clone(), least: job.apart });
     let is_apart = apart.is_some();
