@@ -27,4 +27,4 @@ pub use job::{
 };
 pub use picture_file::PictureFile;
 pub use strategy::Strategy;
-pub use validate::{Problem, validate, validate_local};
+pub use validate::{Problem, local_nodes, validate, validate_local};

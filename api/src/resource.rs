@@ -1,7 +1,7 @@
 //! `RenderJob` as a custom resource of Kubernetes: its definition, and what the operator says of it.
 
 use k8s_openapi::apiextensions_apiserver::pkg::apis::apiextensions::v1::CustomResourceDefinition;
-use k8s_openapi::apimachinery::pkg::apis::meta::v1::{Condition, Time};
+use k8s_openapi::apimachinery::pkg::apis::meta::v1::{Condition, MicroTime, Time};
 use kube::CustomResourceExt;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -77,9 +77,9 @@ pub struct RenderJobStatus {
     /// When work began, or went on after a suspension.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub start_time: Option<Time>,
-    /// When the first trace task was handed out.
+    /// When the first trace task was handed out, to the microsecond.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub first_task_time: Option<Time>,
+    pub first_task_time: Option<MicroTime>,
     /// When it ended.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub completion_time: Option<Time>,

@@ -199,12 +199,17 @@ fn check_workers(c: &mut Checks, job: &RenderJob) {
     c.range("spec.replicas", job.spec.replicas.map(f64::from), 1.0, 16.0);
 }
 
+/// Virtual nodes of a job that runs in one process.
+pub fn local_nodes(job: &RenderJob) -> usize {
+    let workers = &job.spec.workers;
+    workers.nodes.or(workers.max).map_or(workers.slots.len().max(1), |n| n.max(1) as usize)
+}
+
 /// What else is wrong with a job that runs in one process, whose virtual nodes are its stores as well. On a cluster these are servers, of
 /// which there may be more than workers.
 pub fn validate_local(job: &RenderJob) -> Vec<Problem> {
     let mut c = Checks(Vec::new());
-    let workers = &job.spec.workers;
-    let nodes = workers.nodes.or(workers.max).map_or(workers.slots.len().max(1), |n| n.max(1) as usize);
+    let nodes = local_nodes(job);
     if let Some(replicas) = job.spec.replicas {
         c.check("spec.replicas", replicas < 1 || replicas as usize <= nodes, || {
             format!("is {replicas}, but there are {nodes} nodes: ask for at most one copy per node")

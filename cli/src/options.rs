@@ -89,6 +89,17 @@ pub fn check(job: &RenderJob, file: Option<&Path>) -> Result<(), Mistake> {
     told(&rayherd_api::validate(job), file)
 }
 
+/// A file of a cluster may ask for more copies than there are workers, since servers hold them: here each node has one.
+pub fn fit_replicas(job: &mut RenderJob) {
+    let nodes = rayherd_api::local_nodes(job);
+    if let Some(replicas) = job.spec.replicas.filter(|&r| r > 1 && r as usize > nodes) {
+        tracing::warn!(
+            "spec.replicas is {replicas}: here there is one copy on each of {nodes} node(s), and the picture is the same"
+        );
+        job.spec.replicas = Some(nodes as i32);
+    }
+}
+
 /// The same of a job that runs in this process.
 pub fn check_local(job: &RenderJob, file: Option<&Path>) -> Result<(), Mistake> {
     let mut problems = rayherd_api::validate(job);

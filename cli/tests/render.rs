@@ -239,9 +239,22 @@ spec:
     );
     fs::write(folder.path().join("bad.yaml"), job.replace("replicas: 2", "replicas: 3").replace("fov: 20", "fov: 0"))
         .unwrap();
+    assert_mistake(&rayherd(folder.path(), &["render", "-f", "bad.yaml"]), &["bad.yaml: spec.image.cameras[0].fov"]);
+    // a cluster has more servers than the job workers; what is asked for by a flag is meant for here
+    fs::write(
+        folder.path().join("jobs/more.yaml"),
+        job.replace("replicas: 2", "replicas: 3").replace("name: two", "name: more"),
+    )
+    .unwrap();
+    let run = rayherd(folder.path(), &["render", "-f", "jobs/more.yaml"]);
+    assert!(run.code == 0 && run.err.contains("one copy on each of 2 node(s)"), "{}", run.err);
+    assert_eq!(
+        fs::read(folder.path().join("more-front.exr")).unwrap(),
+        fs::read(folder.path().join("two-front.exr")).unwrap()
+    );
     assert_mistake(
-        &rayherd(folder.path(), &["render", "-f", "bad.yaml"]),
-        &["bad.yaml: spec.image.cameras[0].fov", "bad.yaml: spec.replicas: is 3, but there are 2 nodes"],
+        &rayherd(folder.path(), &["render", "-f", "jobs/more.yaml", "--replicas", "3"]),
+        &["--replicas is 3, but there are 2 nodes"],
     );
 }
 

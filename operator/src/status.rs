@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use k8s_openapi::apimachinery::pkg::apis::meta::v1::{Condition, Time};
+use k8s_openapi::apimachinery::pkg::apis::meta::v1::{Condition, MicroTime, Time};
 use k8s_openapi::jiff::{SignedDuration, Timestamp};
 use rayherd_api::resource::{RenderJobObject, RenderJobStatus};
 use rayherd_herd::job::spec::scene_settings;
@@ -165,7 +165,7 @@ fn of(
     // one that was at its end begins anew
     let goes_on = status.completion_time.is_none();
     status.start_time = status.start_time.filter(|_| goes_on).or(state.started.map(Time));
-    status.first_task_time = status.first_task_time.filter(|_| goes_on).or(state.first_task.map(Time));
+    status.first_task_time = status.first_task_time.filter(|_| goes_on).or(state.first_task.map(MicroTime));
     if !state.reports.is_empty() {
         let redone: u64 = state.reports.iter().map(|r| r.tasks_redone).sum();
         status.tasks_redone = Some(state.before.redone + redone as i64);

@@ -218,7 +218,7 @@ fn job(arguments: &Arguments) -> anyhow::Result<RenderJob> {
         Some(file) => {
             // with a profile the source is a key in the storage
             let job = if arguments.profile.is_some() { parse_job(file)? } else { read_job(file)? };
-            options::check_local(&job, Some(file))?;
+            options::check(&job, Some(file))?;
             job
         }
         None => RenderJob::new(RenderJobSpec::default()),
@@ -238,6 +238,9 @@ fn job(arguments: &Arguments) -> anyhow::Result<RenderJob> {
     set(&mut spec.sampling.time_limit, arguments.sampling.time_limit);
     set(&mut spec.image.output, arguments.output.clone());
     set(&mut spec.image.exposure, arguments.exposure);
+    if arguments.run.replicas.is_none() {
+        options::fit_replicas(&mut job);
+    }
     options::check_local(&job, None)?;
     Ok(job)
 }
