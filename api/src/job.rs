@@ -18,6 +18,9 @@ pub const KIND: &str = "RenderJob";
 /// What `spec.managedBy` is for the jobs that the operator works on.
 pub const MANAGED_BY: &str = "rayherd.io/operator";
 
+/// The annotation of a job that somebody watches: as long as it is there, whatever its value, previews of the picture are made.
+pub const PREVIEW: &str = "rayherd.io/preview";
+
 /// One scene, rendered from one or more cameras.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "camelCase", deny_unknown_fields)]
@@ -43,6 +46,9 @@ pub struct Metadata {
     /// Labels.
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
     pub labels: BTreeMap<String, String>,
+    /// Annotations: [`PREVIEW`] among them.
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub annotations: BTreeMap<String, String>,
 }
 
 /// What is wanted of a render. What is left out is taken from the scene file, or else from the defaults named here.

@@ -22,8 +22,8 @@ pub use aov::{Aov, AovList};
 pub use byte_size::ByteSize;
 pub use image_size::ImageSize;
 pub use job::{
-    API_VERSION, CameraSpec, ImageSpec, KIND, LightSpec, MANAGED_BY, Metadata, Placement, RenderJob, RenderJobSpec,
-    SamplingSpec, SceneSpec, StorageSpec, WorkersSpec,
+    API_VERSION, CameraSpec, ImageSpec, KIND, LightSpec, MANAGED_BY, Metadata, PREVIEW, Placement, RenderJob,
+    RenderJobSpec, SamplingSpec, SceneSpec, StorageSpec, WorkersSpec,
 };
 pub use picture_file::PictureFile;
 pub use strategy::Strategy;

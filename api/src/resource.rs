@@ -100,8 +100,9 @@ pub struct LedgerPointer {
 impl RenderJobObject {
     /// The job as a local run reads it from a file.
     pub fn job(&self) -> RenderJob {
-        let metadata =
-            Metadata { name: self.metadata.name.clone(), labels: self.metadata.labels.clone().unwrap_or_default() };
+        let kube::core::ObjectMeta { name, labels, annotations, .. } = self.metadata.clone();
+        let (labels, annotations) = (labels.unwrap_or_default(), annotations.unwrap_or_default());
+        let metadata = Metadata { name, labels, annotations };
         RenderJob { api_version: API_VERSION.into(), kind: KIND.into(), metadata, spec: self.spec.clone() }
     }
 }

@@ -57,6 +57,8 @@ pub struct Shown {
     pub namespace: String,
     /// Its name.
     pub name: String,
+    /// What no other job has, of whatever name.
+    pub uid: String,
     /// `Rendering`, `Complete`, ...: of the spec as it stands now.
     pub phase: String,
     /// Samples made of those asked for.
@@ -288,6 +290,7 @@ fn shown(job: &DynamicObject) -> Shown {
     Shown {
         namespace: job.namespace().unwrap_or_default(),
         name: job.name_any(),
+        uid: job.metadata.uid.clone().unwrap_or_default(),
         phase: status.phase.filter(|_| current).unwrap_or_else(|| "Pending".into()),
         progress: status.progress.unwrap_or_default(),
         error: status.rel_mse.unwrap_or_default(),

@@ -17,7 +17,7 @@ use kube::runtime::controller::Action;
 use kube::runtime::events::{Event, EventType, Recorder, Reporter};
 use kube::{Api, Client, Resource, ResourceExt};
 use rayherd_api::resource::{RenderJobObject, RenderJobStatus};
-use rayherd_api::{MANAGED_BY, Placement, RenderJobSpec, validate};
+use rayherd_api::{MANAGED_BY, PREVIEW, Placement, RenderJobSpec, validate};
 use rayherd_herd::remote::{Storage, Turns};
 use rayherd_herd::store::StoreError;
 use serde_json::json;
@@ -251,6 +251,7 @@ async fn step(job: &Arc<RenderJobObject>, context: &Arc<Context>) -> Result<Acti
         context.jobs.hand_over(&uid);
         return Ok(Action::requeue(AGAIN));
     }
+    running.fleet.show(job.annotations().contains_key(PREVIEW));
     // asked before its end is told: one that comes in between is told next time
     let over = running.is_over();
     if !over {

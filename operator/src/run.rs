@@ -25,6 +25,8 @@ use crate::ledger::{Beside, Ledger};
 
 /// A store that is silent for so long is lost, and what lies on it is copied again: longer than a server takes to start anew.
 const LOST: Duration = Duration::from_secs(15);
+/// Previews of a job that somebody watches are made no more often.
+const PREVIEW_EVERY: Duration = Duration::from_secs(30);
 
 /// Where a job's own objects are.
 pub fn prefix(uid: &str) -> String {
@@ -197,6 +199,9 @@ impl Kept {
 struct Watch(Arc<Running>, String);
 
 impl Progress for Watch {
+    fn wants_preview(&self) -> bool {
+        self.0.fleet.wants_preview(PREVIEW_EVERY)
+    }
     fn status(&self, status: &Status) {
         let first = self.0.fleet.tally().first_attempt;
         let mut state = self.0.lock();

@@ -283,6 +283,26 @@ async fn the_first_worker_comes_up_beside_the_source() {
 }
 
 #[tokio::test]
+async fn a_job_is_shown_as_long_as_its_annotation_asks_for_it() {
+    for asked in [true, false] {
+        let mut watched = job();
+        if asked {
+            watched["metadata"]["annotations"] = json!({"rayherd.io/preview": "true"});
+        }
+        let mut steps = begins(no_pods());
+        let pod = json!({"metadata": {"name": "box-w0", "uid": "p-0"}});
+        steps.extend([
+            step("PATCH", "/api/v1/namespaces/studio/pods/box-w0?", 201, pod),
+            step("PATCH", STATUS, 200, job()).with("/status/phase", json!("Pending")),
+        ]);
+        let (_, _, context) = scenario(&watched, steps).await;
+        let running = context.jobs.get("u-1").expect("it runs");
+        assert_eq!(running.fleet.wants_preview(Duration::from_secs(30)), asked);
+        running.fleet.cancel("the test is over");
+    }
+}
+
+#[tokio::test]
 async fn pods_that_are_refused_are_told_of_and_made_later() {
     let quota = json!({"kind": "Status", "apiVersion": "v1", "status": "Failure", "reason": "Forbidden", "code": 403,
         "message": "pods \"box-w0\" is forbidden: exceeded quota: team"});

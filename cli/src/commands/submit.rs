@@ -2,11 +2,14 @@
 
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use anyhow::Context;
+use bytes::Bytes;
 use clap::Args;
-use rayherd_api::{PictureFile, RenderJob, RenderJobSpec, Strategy};
+use rayherd_api::{PREVIEW, PictureFile, RenderJob, RenderJobSpec, Strategy};
+use rayherd_herd::remote::frames::preview_key;
+use rayherd_herd::store::StoreError;
 use rayherd_scene::inspect::size;
 
 use super::print;
@@ -16,12 +19,14 @@ use crate::frames;
 use crate::image_options::ImageOptions;
 use crate::job_file::parse_job;
 use crate::options::{self, CutOptions, SceneOptions};
-use crate::output::replace;
+use crate::output::{distinct, replace};
 use crate::store::{S3Options, Store};
 use crate::upload::{name_of, upload};
 
 /// Between two looks at a job that is watched.
 const LOOK: Duration = Duration::from_millis(500);
+/// Between two looks for its preview.
+const LOOK_FOR_PREVIEW: Duration = Duration::from_secs(2);
 
 /// Have a scene rendered by a cluster: a job file, or a scene with the flags of `render`
 ///
@@ -50,6 +55,10 @@ pub struct Arguments {
     /// a file of its own, FILE-CAMERA.exr
     #[arg(short, long, value_name = "FILE", requires = "watch", requires = "store")]
     output: Option<PathBuf>,
+    /// Have a preview made from time to time, every 30 s at most, and fetch it to FILE, a PNG; wants --watch and --store. Pixels whose
+    /// rays are under way are too dark in it. Of several cameras it is the one that is being rendered
+    #[arg(long, value_name = "FILE", requires = "watch", requires = "store")]
+    preview: Option<PathBuf>,
     #[command(flatten)]
     scene: SceneOptions,
     #[command(flatten)]
@@ -92,6 +101,10 @@ pub fn run(arguments: &Arguments) -> anyhow::Result<ExitCode> {
         replace::probe(output, "-o")?;
         check_written(&job, output)?;
     }
+    if let Some(preview) = &arguments.preview {
+        check_preview(preview, arguments.output.as_ref())?;
+        job.metadata.annotations.insert(PREVIEW.into(), "true".into());
+    }
     let cluster = Cluster::connect(&arguments.cluster)?;
     if !is_job {
         let Some(store) = &store else {
@@ -106,7 +119,8 @@ pub fn run(arguments: &Arguments) -> anyhow::Result<ExitCode> {
     if !arguments.watch {
         return Ok(ExitCode::SUCCESS);
     }
-    watch(&cluster, &name)?;
+    let mut preview = arguments.preview.as_deref().zip(store.as_ref()).map(|(file, store)| Preview::new(store, file));
+    watch(&cluster, &name, preview.as_mut())?;
     if let (Some(output), Some(store)) = (&arguments.output, &store) {
         for (key, path) in pictures(&job, cluster.namespace(), output) {
             let body = store.wait(store.blocks.get(&key)).with_context(|| format!("cannot fetch {key}"))?;
@@ -133,6 +147,71 @@ fn check_written(job: &RenderJob, output: &Path) -> Result<(), Mistake> {
     )))
 }
 
+fn check_preview(preview: &Path, output: Option<&PathBuf>) -> anyhow::Result<()> {
+    if preview.extension().is_none_or(|e| e != "png") {
+        let told = format!("--preview {} is a PNG: name a file that ends in .png", preview.display());
+        return Err(Mistake(told).into());
+    }
+    replace::probe(preview, "--preview")?;
+    let all: Vec<PathBuf> = output.into_iter().cloned().chain([preview.to_owned()]).collect();
+    Ok(distinct::check_outputs(&all)?)
+}
+
+/// The preview of a job in its storage, and the file here that follows it.
+struct Preview<'a> {
+    store: &'a Store,
+    file: &'a Path,
+    /// As it was fetched last, and what the store knows it by, if it does.
+    tag: Option<String>,
+    body: Bytes,
+    looked: Option<Instant>,
+}
+
+impl<'a> Preview<'a> {
+    fn new(store: &'a Store, file: &'a Path) -> Self {
+        Preview { store, file, tag: None, body: Bytes::new(), looked: None }
+    }
+
+    /// Fetches it if it has changed; whether it has.
+    fn fetch(&mut self, uid: &str) -> anyhow::Result<bool> {
+        let key = preview_key(&format!("jobs/{uid}"));
+        let mut tag = None;
+        if let Some(found) = self.store.wait(self.store.blocks.list_versions(&key))? {
+            let Some(version) = found.into_iter().find(|v| v.key == key) else { return Ok(false) };
+            if self.tag.as_ref() == Some(&version.tag) {
+                return Ok(false);
+            }
+            tag = Some(version.tag);
+        }
+        let body = match self.store.wait(self.store.blocks.get(&key)) {
+            Ok(body) => body,
+            // not made yet, or the job has just come to its end
+            Err(StoreError::NotFound { .. }) => return Ok(false),
+            Err(e) => return Err(e.into()),
+        };
+        self.tag = tag;
+        if self.body == body {
+            return Ok(false);
+        }
+        replace::replace(self.file, &body)?;
+        self.body = body;
+        Ok(true)
+    }
+
+    /// Looks now and then. What goes wrong with it is no reason to stop watching.
+    fn look(&mut self, uid: &str) {
+        if self.looked.is_some_and(|t| t.elapsed() < LOOK_FOR_PREVIEW) {
+            return;
+        }
+        self.looked = Some(Instant::now());
+        match self.fetch(uid) {
+            Ok(true) => eprintln!("preview {}", self.file.display()),
+            Ok(false) => {}
+            Err(e) => tracing::warn!("no preview: {e:#}"),
+        }
+    }
+}
+
 /// Key in the storage and file here of each picture of a job that has a name.
 fn pictures(job: &RenderJob, namespace: &str, output: &Path) -> Vec<(String, PathBuf)> {
     let name = job.metadata.name.clone().unwrap_or_default();
@@ -147,7 +226,7 @@ fn pictures(job: &RenderJob, namespace: &str, output: &Path) -> Vec<(String, Pat
 }
 
 /// Shows each change until the job has come to its end.
-fn watch(cluster: &Cluster, name: &str) -> anyhow::Result<()> {
+fn watch(cluster: &Cluster, name: &str, mut preview: Option<&mut Preview>) -> anyhow::Result<()> {
     let mut said = String::new();
     loop {
         let job = cluster.job(name)?;
@@ -160,7 +239,12 @@ fn watch(cluster: &Cluster, name: &str) -> anyhow::Result<()> {
         match (job.phase.as_str(), job.why) {
             ("Complete", _) => return Ok(()),
             ("Failed", why) => return Err(Mistake(format!("job {name} failed: {}", why.unwrap_or_default())).into()),
-            _ => std::thread::sleep(LOOK),
+            _ => {
+                if let Some(preview) = &mut preview {
+                    preview.look(&job.uid);
+                }
+                std::thread::sleep(LOOK);
+            }
         }
     }
 }
@@ -170,6 +254,35 @@ mod tests {
     use rayherd_api::CameraSpec;
 
     use super::*;
+
+    #[test]
+    fn a_preview_follows_the_one_in_the_storage() {
+        let folder = tempfile::tempdir().unwrap();
+        let at = |name: &str| folder.path().join(name);
+        std::fs::create_dir(at("store")).unwrap();
+        let store = Store::existing(at("store").to_str().unwrap(), &S3Options::default()).unwrap();
+        let file = at("seen.png");
+        let mut preview = Preview::new(&store, &file);
+        let put = |body: &'static str| store.wait(store.blocks.put("jobs/u-1/preview.png", body.into())).unwrap();
+        assert!(!preview.fetch("u-1").unwrap() && !file.exists());
+        put("one");
+        assert!(preview.fetch("u-1").unwrap() && !preview.fetch("u-1").unwrap());
+        put("two");
+        assert!(!preview.fetch("u-2").unwrap(), "another job's");
+        assert!(preview.fetch("u-1").unwrap());
+        assert_eq!(std::fs::read(&file).unwrap(), b"two");
+        // the job is over: what was seen last stays here
+        store.wait(store.blocks.delete(&["jobs/u-1/preview.png".to_owned()])).unwrap();
+        assert!(!preview.fetch("u-1").unwrap() && file.exists());
+        for (path, output, part) in [
+            (at("a.jpg"), None, "ends in .png"),
+            (at("none/a.png"), None, "cannot write"),
+            (at("seen.png"), Some(at("seen.png")), "two results"),
+        ] {
+            let error = check_preview(&path, output.as_ref()).unwrap_err().to_string();
+            assert!(error.contains(part), "{error}");
+        }
+    }
 
     #[test]
     fn pictures_are_where_the_operator_puts_them_and_go_where_render_would() {

@@ -94,37 +94,84 @@ impl Adder<'_> {
         out: impl Write + Seek,
         mut seen: impl FnMut(&[[f32; 3]]) -> Result<(), JobError>,
     ) -> Result<Totals, JobError> {
-        let Layout { size: [width, height], aovs } = self.layout;
-        let across = width.div_ceil(TILE);
-        let (mut totals, mut current): (Totals, Option<(u32, FilmPart)>) = Default::default();
-        let beside: Vec<&str> = aovs.channels().collect();
-        // rows of the tiles that are being written, one after the other
-        let mut rows = Row::new(width as usize * TILE as usize, beside.len());
+        let beside: Vec<&str> = self.layout.aovs.channels().collect();
+        let mut rows = Rows::new(self, parts, samples, (offset, beside.len()));
         let next = |y: u32, row: &mut Row| -> Result<(), JobError> {
-            let at = |x: u32, y: u32| (y % TILE * width + x) as usize;
-            if y.is_multiple_of(TILE) {
-                rows.light.fill([0.0; 3]);
-                for tile in (y / TILE * across)..(y / TILE + 1) * across {
-                    let band = tile / self.band.max(1);
-                    if current.as_ref().is_none_or(|c| c.0 != band) {
-                        // the one before goes first
-                        current = None;
-                        let sum = self.sum(parts, Some(band))?;
-                        totals.add(sum.error_sum(samples), sum.rejected().keys.iter().copied());
-                        current = Some((band, sum));
-                    }
-                    if let Some((_, sum)) = &current {
-                        sum.resolve_tile(tile, samples, |x, y, value| rows.light[at(x, y)] = value);
-                        sum.channels_of_tile(tile, samples, offset, |x, y, channel, value| {
-                            rows.beside[channel][at(x, y)] = value;
+            rows.next(y, row)?;
+            seen(&row.light)
+        };
+        picture::write(self.layout.size, &beside, definition, next, out)?;
+        Ok(rows.totals)
+    }
+
+    /// The rows of that picture alone, from the top down, without its layers: of a film that may not be finished.
+    ///
+    /// # Errors
+    /// When a part cannot be read, or a row is not taken.
+    pub fn show(
+        &self,
+        parts: &[FilmRef],
+        samples: u32,
+        mut seen: impl FnMut(&[[f32; 3]]) -> Result<(), JobError>,
+    ) -> Result<(), JobError> {
+        let [width, height] = self.layout.size;
+        let mut rows = Rows::new(self, parts, samples, ([0.0; 3], 0));
+        let mut row = Row::new(width as usize, 0);
+        for y in 0..height {
+            rows.next(y, &mut row)?;
+            seen(&row.light)?;
+        }
+        Ok(())
+    }
+}
+
+/// The rows of a picture, of which one band of the film is in memory at a time.
+struct Rows<'a> {
+    adder: &'a Adder<'a>,
+    parts: &'a [FilmRef],
+    samples: u32,
+    offset: [f64; 3],
+    totals: Totals,
+    current: Option<(u32, FilmPart)>,
+    /// Of the tiles that are side by side, one after the other.
+    rows: Row,
+}
+
+impl<'a> Rows<'a> {
+    /// With so many channels beside the picture: all, or none.
+    fn new(adder: &'a Adder, parts: &'a [FilmRef], samples: u32, (offset, beside): ([f64; 3], usize)) -> Self {
+        let rows = Row::new(adder.layout.size[0] as usize * TILE as usize, beside);
+        Rows { adder, parts, samples, offset, totals: Totals::default(), current: None, rows }
+    }
+
+    /// Row `y`, after the one above it.
+    fn next(&mut self, y: u32, row: &mut Row) -> Result<(), JobError> {
+        let width = self.adder.layout.size[0];
+        let at = |x: u32, y: u32| (y % TILE * width + x) as usize;
+        if y.is_multiple_of(TILE) {
+            let across = width.div_ceil(TILE);
+            self.rows.light.fill([0.0; 3]);
+            for tile in (y / TILE * across)..(y / TILE + 1) * across {
+                let band = tile / self.adder.band.max(1);
+                if self.current.as_ref().is_none_or(|c| c.0 != band) {
+                    // the one before goes first
+                    self.current = None;
+                    let sum = self.adder.sum(self.parts, Some(band))?;
+                    self.totals.add(sum.error_sum(self.samples), sum.rejected().keys.iter().copied());
+                    self.current = Some((band, sum));
+                }
+                if let Some((_, sum)) = &self.current {
+                    let Row { light, beside } = &mut self.rows;
+                    sum.resolve_tile(tile, self.samples, |x, y, value| light[at(x, y)] = value);
+                    if !beside.is_empty() {
+                        sum.channels_of_tile(tile, self.samples, self.offset, |x, y, channel, value| {
+                            beside[channel][at(x, y)] = value;
                         });
                     }
                 }
             }
-            row.copy_from(&rows, at(0, y));
-            seen(&row.light)
-        };
-        picture::write([width, height], &beside, definition, next, out)?;
-        Ok(totals)
+        }
+        row.copy_from(&self.rows, at(0, y));
+        Ok(())
     }
 }

@@ -72,6 +72,8 @@ pub fn keys(work: &Work) -> Vec<String> {
             let first = parts.first().map_or("nothing", |p| p.key.as_str());
             vec![format!("adding up {} parts of the film (band {band:?}, from {first} on)", parts.len())]
         }
+        // it is not tried again
+        Work::Preview { .. } => Vec::new(),
         Work::Copy { gone, .. } => vec![format!("copying rays and film that lay on store {gone}")],
         Work::Restore { gone } => vec![format!("copying what of the scene lay on store {gone}")],
     }

@@ -26,6 +26,8 @@ use crate::report;
 use crate::scenes;
 use crate::store::{BlockStore, SceneObjects, StoreError, object_key};
 
+/// How long the end of a job waits for whoever makes a preview of it to stop: it hears that it is to with its next sign of life.
+const STOPS: Duration = Duration::from_secs(5);
 /// How long the first plan of a frame waits for workers that are not there yet.
 const GATHER: Duration = Duration::from_secs(3);
 
@@ -94,7 +96,21 @@ pub struct Job<'a> {
 /// When it cannot be finished; what was committed stays.
 pub fn run(job: &Job, keeper: &Arc<dyn Keeper>, progress: &dyn Progress) -> Result<(), JobError> {
     let no_bucket = |e: JobError| if e.may_pass() { job.depot.without_bucket().map_or(e, JobError::from) } else { e };
-    frames(job, keeper, progress).map_err(no_bucket)
+    let done = frames(job, keeper, progress).map_err(no_bucket);
+    // whoever goes on with the job makes another
+    if !matches!(done, Err(JobError::Owned(_))) && job.fleet.end_previews(STOPS) {
+        let key = [preview_key(&job.prefix)];
+        let gone = futures::future::join_all(job.depot.stores().iter().map(|store| store.delete(&key)));
+        for e in job.runtime.block_on(gone).into_iter().filter_map(Result::err) {
+            tracing::warn!("a preview goes with the job: {e}");
+        }
+    }
+    done
+}
+
+/// The key of the preview of a job whose own objects are below a prefix: of the frame that is being rendered.
+pub fn preview_key(prefix: &str) -> String {
+    format!("{prefix}/preview.png")
 }
 
 fn frames(job: &Job, keeper: &Arc<dyn Keeper>, progress: &dyn Progress) -> Result<(), JobError> {
@@ -249,7 +265,8 @@ fn render(
     let start = Start {
         reused: if lost.is_some() { resumed.settled.0.commits } else { resumed.ledger.commits() },
         ledger: resumed.ledger,
-        film: Parts::new(job.fleet, film, resumed.film, resumed.settled.1),
+        film: Parts::new(job.fleet, film, resumed.film, resumed.settled.1)
+            .shown(preview_key(&job.prefix), job.spec.image.exposure.unwrap_or(0.0)),
         settled: resumed.settled.0,
         pointer: Some(Arc::new(pointer)),
         session: job.session.clone(),

@@ -43,6 +43,9 @@ pub struct Poll {
     /// It builds blocks of scenes that others cut.
     #[serde(default)]
     pub builds: bool,
+    /// It makes pictures of films that are not finished.
+    #[serde(default)]
+    pub previews: bool,
     /// What its cache holds of the stage's scene, if it has one.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub holds: Option<Holds>,
@@ -167,6 +170,17 @@ pub enum Work {
         /// Only this band of the film; the whole without one.
         #[serde(default)]
         band: Option<u32>,
+    },
+    /// Make a picture of a film that is not finished, for whoever watches. Nobody waits for it.
+    Preview {
+        /// What to add.
+        parts: Vec<FilmRef>,
+        /// Samples per pixel, about: what waits or is being made is missing.
+        spp: u32,
+        /// The key of the storage where it is written, as PNG.
+        key: String,
+        /// Its exposure in stops.
+        exposure: f64,
     },
     /// Copy rays and film whose copies on one store cannot be had, from those that are left.
     Copy {
@@ -297,6 +311,8 @@ pub enum Done {
         /// Where the picture lies, if it was asked for.
         picture: Vec<String>,
     },
+    /// Of a picture of a film that is not finished.
+    Previewed,
     /// Of copying.
     Copied {
         /// Where the objects lie now; those without a copy that can be had are left out.

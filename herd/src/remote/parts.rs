@@ -4,7 +4,7 @@ use super::bands::{self, Totals};
 use super::fleet::Fleet;
 use super::message::{Done, Work};
 use crate::driver::{FilmSum, Objects};
-use crate::job::JobError;
+use crate::job::{Image, JobError};
 use crate::ledger::FilmRef;
 use crate::local::attempt::Made;
 
@@ -22,6 +22,8 @@ pub struct Parts<'f> {
     settled: Vec<FilmRef>,
     /// The last error that was found, and of how many samples; none when the film has changed since.
     error: Option<(u32, Option<f64>)>,
+    /// Where previews are written, and their exposure in stops.
+    shown: Option<(String, f64)>,
 }
 
 /// A picture that was made.
@@ -35,7 +37,12 @@ pub struct Pictured {
 impl<'f> Parts<'f> {
     /// A film of `size` pixels in bands of so many tiles whose parts are these; `settled` is what to go back to.
     pub fn new(fleet: &'f Fleet, (size, band): ([u32; 2], u32), now: Vec<FilmRef>, settled: Vec<FilmRef>) -> Self {
-        Parts { fleet, size, bands: bands::count(size, band), now, settled, error: None }
+        Parts { fleet, size, bands: bands::count(size, band), now, settled, error: None, shown: None }
+    }
+
+    /// The same, of which previews are made for whoever asks the fleet for them.
+    pub fn shown(self, key: String, exposure: f64) -> Self {
+        Parts { shown: Some((key, exposure)), ..self }
     }
 
     /// In how many bands it is added up now: as a whole while a worker of a version without them is there.
@@ -135,6 +142,13 @@ impl FilmSum for Parts<'_> {
         let error = self.look(spp)?;
         self.error = Some((spp, error));
         Ok(error)
+    }
+    /// A worker makes it, when it has nothing else to do: there is no picture here.
+    fn preview(&self, spp: u32) -> Option<Image> {
+        if let Some((key, exposure)) = self.shown.clone().filter(|_| !self.now.is_empty()) {
+            self.fleet.preview(Work::Preview { parts: self.now.clone(), spp, key, exposure });
+        }
+        None
     }
     fn on_store(&self, store: u32) -> Objects {
         let mut all: Objects = Vec::new();

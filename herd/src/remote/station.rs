@@ -288,6 +288,7 @@ impl<'l> Station<'l> {
                 bands: true,
                 aovs: true,
                 builds: true,
+                previews: true,
                 holds: open.and_then(Opened::holds),
             };
             match self.link.poll(&poll) {
@@ -390,15 +391,18 @@ impl<'l> Station<'l> {
             }
             Work::Merge { name, parts, spp, picture, band } => {
                 let (stage, shared) = open()?;
-                let read = |part: &FilmRef| {
-                    let open = |body: &bytes::Bytes| codec::open_film(stage.frame.layout(), body);
-                    shared.nodes.get(self.node(), Kind::Film, &part.key, &part.holders, open)
-                };
+                let read = self.reads_film(stage, shared);
                 let adder = Adder { layout: stage.frame.layout(), band: stage.band, read: &read };
                 match picture {
                     Some(key) => self.picture(&adder, (stage, shared), parts, *spp, key),
                     None => self.merge(&adder, shared, name.as_deref(), (parts, *band), *spp),
                 }
+            }
+            Work::Preview { parts, spp, key, exposure } => {
+                let (stage, shared) = open()?;
+                let read = self.reads_film(stage, shared);
+                let adder = Adder { layout: stage.frame.layout(), band: stage.band, read: &read };
+                self.preview(&adder, parts, *spp, (key, *exposure), stop)
             }
             Work::Copy { objects, gone } => {
                 let (_, shared) = open()?;
@@ -456,6 +460,21 @@ impl<'l> Station<'l> {
         self.depot.home().unwrap_or(self.depot.len())
     }
 
+    fn reads_film<'a>(
+        &'a self,
+        stage: &'a Stage,
+        shared: &'a Shared,
+    ) -> impl Fn(&FilmRef) -> Result<Vec<u8>, JobError> + 'a {
+        move |part| {
+            let open = |body: &bytes::Bytes| codec::open_film(stage.frame.layout(), body);
+            shared.nodes.get(self.node(), Kind::Film, &part.key, &part.holders, open)
+        }
+    }
+
+    fn no_room(&self, e: std::io::Error) -> JobError {
+        JobError::Settings(format!("cannot write a picture in {}: {e}; give it room", self.scratch.display()))
+    }
+
     fn merge(
         &self,
         adder: &Adder,
@@ -478,6 +497,33 @@ impl<'l> Station<'l> {
         Ok(merged(adder, film, sum.error_sum(spp), non_finite, Vec::new()))
     }
 
+    /// Makes a PNG of a film that is not finished, in a file of our own, then puts it on the stores that take it.
+    fn preview(
+        &self,
+        adder: &Adder,
+        parts: &[FilmRef],
+        spp: u32,
+        (key, exposure): (&str, f64),
+        stop: &StopFlag,
+    ) -> Result<Done, JobError> {
+        let io = |e| self.no_room(e);
+        std::fs::create_dir_all(&self.scratch).map_err(io)?;
+        let file = tempfile::NamedTempFile::new_in(&self.scratch).map_err(io)?;
+        let mut rows = png_file::Rows::new(file.reopen().map_err(io)?, adder.layout.size, exposure).map_err(io)?;
+        adder.show(parts, spp, |row| {
+            stop.check()?;
+            rows.add(row).map_err(io)
+        })?;
+        rows.finish().and_then(|()| png_file::check_end(file.as_file())).map_err(io)?;
+        for store in self.depot.stores() {
+            stop.check()?;
+            if let Err(e) = self.runtime.block_on(store.put_file(key, file.path())) {
+                tracing::warn!("no preview: {e}");
+            }
+        }
+        Ok(Done::Previewed)
+    }
+
     /// Makes a picture in a file of our own, and the PNG beside it, then puts those that are wanted on the stores that take them.
     fn picture(
         &self,
@@ -487,9 +533,7 @@ impl<'l> Station<'l> {
         spp: u32,
         key: &str,
     ) -> Result<Done, JobError> {
-        let io = |e: std::io::Error| {
-            JobError::Settings(format!("cannot write a picture in {}: {e}; give it room", self.scratch.display()))
-        };
+        let io = |e| self.no_room(e);
         std::fs::create_dir_all(&self.scratch).map_err(io)?;
         // gone with the value
         let file = tempfile::NamedTempFile::new_in(&self.scratch).map_err(io)?;

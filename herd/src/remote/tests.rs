@@ -2,6 +2,7 @@
 
 mod apart;
 mod cached;
+mod previews;
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::atomic::{AtomicU32, Ordering};
@@ -295,6 +296,7 @@ pub(super) fn poll(number: u32, session: &str) -> Poll {
         bands: true,
         aovs: true,
         builds: true,
+        previews: true,
         holds: None,
     }
 }

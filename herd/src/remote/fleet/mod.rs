@@ -3,6 +3,7 @@
 //! A worker that is not heard of for [`SILENCE`], or that starts again, has lost what it was doing. What it reports later
 //! is refused: its id is known no more.
 
+mod preview;
 mod state;
 mod tally;
 #[cfg(test)]
@@ -66,6 +67,7 @@ impl Fleet {
         state.placement = placement;
         state.read = Default::default();
         state.stage = Some(stage);
+        state.preview.waiting = None;
         state.emptied.clear();
         for worker in state.workers.iter_mut().flatten() {
             // the splits of another scene may have these numbers now
@@ -242,6 +244,12 @@ impl Fleet {
         {
             state.first_attempt.get_or_insert_with(Instant::now);
             (What::Attempt { task, number, stop }, work)
+        } else if poll.clerk
+            && poll.previews
+            && let Some(work) = state.preview.waiting.take()
+        {
+            state.preview.made = true;
+            (What::Preview { stop: Default::default() }, work)
         } else {
             return Ok(Answer::Wait);
         };
@@ -296,6 +304,7 @@ impl Fleet {
                 tracing::warn!("{message}; trying again");
                 state.common.push_back((call, work));
             }
+            (What::Preview { .. }, result) => tracing::debug!("preview: {result:?}"),
             (What::Call { call, .. }, result) => {
                 if result.is_ok() {
                     state.succeeded();
@@ -320,7 +329,7 @@ impl Fleet {
         }
         let superfluous = |id: &&String| match state.doing.get(*id).map(|d| &d.what) {
             None => true,
-            Some(What::Attempt { stop, .. }) => stop.is_set(),
+            Some(What::Attempt { stop, .. } | What::Preview { stop }) => stop.is_set(),
             Some(What::Call { .. }) => false,
         };
         Ok(beat.running.iter().filter(superfluous).cloned().collect())

@@ -5,6 +5,7 @@ use std::time::{Duration, Instant};
 
 use super::super::deaths::{Deaths, Held, MOST_DEATHS};
 use super::super::message::{Beat, Done, Failure, Holds, Poll, Stage, Work, WorkerId};
+use super::preview::Preview;
 use super::{MOST_FAILURES, Outcome, PATIENCE, SILENCE, Unknown, WorkerTally};
 use crate::driver::Finished;
 use crate::job::JobError;
@@ -49,6 +50,7 @@ pub struct State {
     /// Splits and texture tiles that somebody has read in this stage.
     pub read: [BTreeSet<u32>; 2],
     pub first_attempt: Option<Instant>,
+    pub preview: Preview,
     pub over: bool,
     /// Another fleet has the workers now.
     pub retired: bool,
@@ -88,8 +90,19 @@ pub struct Doing {
 }
 
 pub enum What {
-    Attempt { task: TaskId, number: u32, stop: StopFlag },
-    Call { call: u64, work: Work },
+    Attempt {
+        task: TaskId,
+        number: u32,
+        stop: StopFlag,
+    },
+    Call {
+        call: u64,
+        work: Work,
+    },
+    /// A picture of the film so far: nobody waits for it, and it is not tried again.
+    Preview {
+        stop: StopFlag,
+    },
 }
 
 /// Whether a home is one of these stores.
@@ -218,7 +231,7 @@ impl State {
         match self.doing.remove(id).map(|d| d.what) {
             Some(What::Attempt { task, number, .. }) => self.lose(task, number),
             Some(What::Call { call, work }) => self.common.push_front((call, work)),
-            None => {}
+            Some(What::Preview { .. }) | None => {}
         }
     }
 

@@ -60,6 +60,47 @@ fn attempts_that_a_dead_worker_had_begun_are_lost_and_those_that_it_had_not_are_
     assert_eq!(fleet.tally().outcomes, BTreeMap::from([(Outcome::Gone, 2), (Outcome::Stopped, 1)]));
 }
 
+/// Whatever comes of it: nobody waits, nothing is tried again, and only a clerk of a version that knows how is asked.
+#[test]
+fn a_preview_is_made_by_a_clerk_at_most_once_and_keeps_nobody() {
+    let fleet = Fleet::new(1, "e");
+    let slot = poll(0, "s");
+    let clerk = Poll { clerk: true, ..slot.clone() };
+    let old = Poll { previews: false, ..clerk.clone() };
+    let work = Work::Preview { parts: Vec::new(), spp: 1, key: "k".into(), exposure: 0.0 };
+    let answer = |poll: &Poll| given(fleet.answer(poll).unwrap());
+    assert!(!fleet.wants_preview(Duration::ZERO), "nobody asks");
+    fleet.show(true);
+    for end in ["fails", "is killed for lack of memory", "goes"] {
+        assert!(fleet.wants_preview(Duration::ZERO));
+        fleet.preview(work.clone());
+        assert!(!fleet.wants_preview(Duration::ZERO), "one waits");
+        assert_eq!((answer(&slot), answer(&old)), (None, None));
+        let (id, taken) = answer(&clerk).unwrap();
+        assert_eq!(taken, work);
+        assert!(!fleet.wants_preview(Duration::ZERO), "one is made");
+        match end {
+            "fails" => {
+                let failed = Err(Failure::ForNow { message: "no".into() });
+                assert_eq!(fleet.report(report(&slot.worker, &id, failed)), Ok(true));
+            }
+            "goes" => fleet.gone(&slot.worker),
+            _ => fleet.killed_for_memory(0, None),
+        }
+        assert_eq!(answer(&clerk), None, "{end}: it is not tried again");
+        assert!(fleet.wants_preview(Duration::ZERO) && !fleet.wants_preview(Duration::from_secs(3600)), "{end}");
+    }
+    fleet.check().unwrap();
+    assert_eq!(fleet.tally().outcomes, BTreeMap::new());
+    // at the end of the job whoever makes one is told to stop
+    fleet.preview(work);
+    let (id, _) = answer(&clerk).unwrap();
+    let beat = Beat { worker: slot.worker.clone(), running: vec![id.clone()] };
+    assert_eq!(fleet.beat(&beat), Ok(Vec::new()));
+    assert!(fleet.end_previews(Duration::ZERO));
+    assert_eq!(fleet.beat(&beat), Ok(vec![id]));
+}
+
 /// As a link does that is cut for less than a worker is silent for.
 #[test]
 fn work_whose_answer_was_lost_on_its_way_is_given_out_again() {
