@@ -6,6 +6,7 @@ use std::fs;
 use std::path::Path;
 
 use common::{Run, assert_mistake, rayherd, repository};
+use rayherd_herd::profile::Part;
 use rayherd_render::bvh::{Kernel, Tracer};
 use serde_json::Value;
 
@@ -120,6 +121,37 @@ fn assert_nested_keys(report: &Value, documentation: &str) {
         for key in expected {
             assert!(row.contains(&format!("`{key}`")), "{key} of {place} is not in {row}");
         }
+    }
+}
+
+/// `--profile` changes no byte; the report has what each stage took, and so does a table at the end.
+#[test]
+fn a_profile_says_what_each_stage_takes() {
+    let folder = tempfile::tempdir().unwrap();
+    let plain = cornell(folder.path(), "a.exr", &["--report", "a.json"]);
+    let measured = cornell(folder.path(), "b.exr", &["--report", "b.json", "--profile"]);
+    assert_eq!((plain.code, measured.code), (0, 0), "{}{}", plain.err, measured.err);
+    let read = |name: &str| fs::read(folder.path().join(name)).unwrap();
+    assert!(read("a.exr") == read("b.exr"));
+    let [a, b]: [Value; 2] = ["a.json", "b.json"].map(|name| serde_json::from_slice(&read(name)).unwrap());
+    assert!(a["profile"].is_null(), "{}", a["profile"]);
+    let profile = b["profile"].as_object().unwrap();
+    let text = fs::read_to_string(repository("docs/report.md")).unwrap();
+    let row = text.lines().find(|l| l.starts_with("| `profile`")).unwrap();
+    for part in Part::ALL {
+        let cost = &profile[part.name()];
+        assert!(cost["cpu_s"].is_f64() && cost["items"].is_u64(), "{}: {cost}", part.name());
+        assert!(row.contains(&format!("`{}`", part.name())), "{} is not in {row}", part.name());
+        // the table leaves out what there was nothing of
+        let told = measured.out.lines().any(|l| l.starts_with(&format!("{} ", part.name())));
+        assert_eq!(told, cost["items"] != 0, "{}: {}", part.name(), measured.out);
+        assert!(!plain.out.lines().any(|l| l.starts_with(&format!("{} ", part.name()))), "{}", plain.out);
+    }
+    assert_eq!(profile.len(), Part::ALL.len());
+    // in one task every ray is made, traced and shaded once
+    let rays = &b["rays"];
+    for (part, count) in [("camera", "camera"), ("closest", "closest"), ("shading", "closest"), ("shadow", "shadow")] {
+        assert_eq!(profile[part]["items"], rays[count], "{part}");
     }
 }
 

@@ -143,7 +143,7 @@ fn a_scene_goes_there_and_comes_back(store: &str, profile: &str, run: Runs) {
          image: {{size: 16x16}}, sampling: {{spp: 4}}, splits: 3, replicas: 1}}}}"
     );
     fs::write(folder.join("job.yaml"), job).unwrap();
-    let there = run(folder, &["render", "-f", "job.yaml", "--profile", "profile.yaml", "-o", "there.exr"], &[]);
+    let there = run(folder, &["render", "-f", "job.yaml", "--storage-profile", "profile.yaml", "-o", "there.exr"], &[]);
     assert_eq!(there.code, 0, "{}", there.err);
     let here = common::rayherd(folder, &["render", "-f", "job.yaml", "--scene", "box/box.xml", "-o", "here.exr"]);
     assert_eq!(here.code, 0, "{}", here.err);
@@ -167,10 +167,10 @@ fn a_scene_is_submitted_and_rendered_by_its_profile() {
     let job =
         "{apiVersion: rayherd.io/v1alpha1, kind: RenderJob, metadata: {name: b}, spec: {scene: {source: no/such.xml}}}";
     fs::write(folder.join("job.yaml"), job).unwrap();
-    let of_profile = ["render", "-f", "job.yaml", "--profile", "p.yaml", "-o", "x.exr"];
+    let of_profile = ["render", "-f", "job.yaml", "--storage-profile", "p.yaml", "-o", "x.exr"];
     assert_mistake(&run(folder, &of_profile, &[]), &["no/such.xml", "upload the scene first"]);
     assert_mistake(&common::rayherd(folder, &of_profile), &["p.yaml", "--s3-endpoint"]);
-    assert_eq!(common::rayherd(folder, &["render", "x.ply", "--profile", "p.yaml"]).code, 2);
+    assert_eq!(common::rayherd(folder, &["render", "x.ply", "--storage-profile", "p.yaml"]).code, 2);
 }
 
 /// Parts that were sent before the server went away are not sent again, and no file is held in memory.

@@ -8,6 +8,7 @@ pub mod local;
 pub mod picture;
 pub mod plan;
 pub mod png_file;
+pub mod profile;
 pub mod remote;
 pub mod report;
 pub mod resident;

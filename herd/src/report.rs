@@ -4,6 +4,8 @@ use std::collections::BTreeMap;
 
 use serde::{Deserialize, Serialize};
 
+use crate::profile::Profile;
+
 /// When bytes moved.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
@@ -215,6 +217,9 @@ pub struct Report {
     pub skipped: BTreeMap<String, u64>,
     /// What was not done because the scene does not need it, by the names of [`rayherd_render::skip::Skip`]: by committed tasks of this run.
     pub skips: BTreeMap<String, u64>,
+    /// What each stage of committed tasks of this run cost, if that was asked for.
+    #[serde(default)]
+    pub profile: Option<Profile>,
 }
 
 impl Report {

@@ -117,6 +117,8 @@ pub fn start(
             slots,
             band: BAND,
             apart: APART,
+            // a RenderJob does not ask for it
+            profile: false,
             runtime,
         };
         let keeper: Arc<dyn Keeper> = Arc::new(keeper);

@@ -11,6 +11,7 @@ use rayherd_herd::job::spec;
 use rayherd_herd::job::{Commits, JobSettings, PreparedScene, Sampling};
 use rayherd_herd::local::{JobOutcome, render_local};
 use rayherd_herd::picture;
+use rayherd_herd::profile::{Part, Profile};
 use rayherd_herd::report::{Kind, Op, Report};
 use rayherd_render::frame::Frame;
 use rayherd_render::skip::Skip;
@@ -45,7 +46,8 @@ pub const OBJECTS_IN_MEMORY: u64 = 256 << 20;
     rayherd render chest-ct --iso -789.5 --size 512x512 --target-error 0.01\n  \
     rayherd render scene.xml --nodes 4 --slots 2,2,4,4 --memory 64Mi --splits 32 --report r.json\n  \
     rayherd render -f job.yaml\n  \
-    rayherd render -f job.yaml --profile storage.yaml --s3-endpoint http://localhost:9000\n  \
+    rayherd render scene.xml --profile\n  \
+    rayherd render -f job.yaml --storage-profile storage.yaml --s3-endpoint http://localhost:9000\n  \
     rayherd render scene.xml --spp 4096 --store results --resume")]
 pub struct Arguments {
     /// Mitsuba XML, mesh (PLY, OBJ, STL), folder of meshes, or CT volume (DICOM folder, NRRD, NIfTI)
@@ -60,7 +62,7 @@ pub struct Arguments {
     /// With -f, fetch the job's scene from the storage of this profile: the chart's ConfigMap, or the profile.yaml in it; --s3-endpoint
     /// names a server where the profile's are inside the cluster
     #[arg(long, value_name = "YAML", requires = "file", conflicts_with_all = ["scene", "local"])]
-    profile: Option<PathBuf>,
+    storage_profile: Option<PathBuf>,
     /// The EXR; the PNG goes beside it (see --files) [default: ./SCENE.exr]
     #[arg(short, long, value_name = "EXR")]
     output: Option<String>,
@@ -73,6 +75,9 @@ pub struct Arguments {
     /// Write what was done and counted as JSON (an array when there are several cameras)
     #[arg(long, value_name = "JSON")]
     report: Option<PathBuf>,
+    /// Measure what each stage of the work costs: a table at the end, and `profile` in the report
+    #[arg(long)]
+    profile: bool,
     #[command(flatten)]
     image: ImageOptions,
     #[command(flatten)]
@@ -124,7 +129,7 @@ struct SamplingOptions {
 /// Renders every frame of the job.
 pub fn run(arguments: &Arguments) -> anyhow::Result<ExitCode> {
     let mut job = job(arguments)?;
-    let settings = arguments.run.settings(&job.spec)?;
+    let settings = JobSettings { profile: arguments.profile, ..arguments.run.settings(&job.spec)? };
     use_threads(settings.threads)?;
     let files = frames::files(&job);
     frames::check_files(&files)?;
@@ -145,7 +150,7 @@ pub fn run(arguments: &Arguments) -> anyhow::Result<ExitCode> {
     let keep = &arguments.keep;
     let origin = job.spec.scene.source.clone();
     // goes with its folder at the end
-    let _fetched = match &arguments.profile {
+    let _fetched = match &arguments.storage_profile {
         Some(profile) => {
             let fetched = storage::fetch(profile, keep.s3.s3_endpoint.as_deref(), &job.spec.scene.source)?;
             job.spec.scene.source = fetched.source.to_string_lossy().into_owned();
@@ -200,6 +205,9 @@ pub fn run(arguments: &Arguments) -> anyhow::Result<ExitCode> {
             None => saved?,
         }
         tell(&shot.written(&job.spec.image), &shot.frame, &outcome.report, &sampling)?;
+        if let Some(profile) = &outcome.report.profile {
+            print(&costs(profile, outcome.report.nodes_detail.iter().map(|n| n.busy).sum()))?;
+        }
         reports.push(outcome.report);
     }
     if let Some(path) = &arguments.report {
@@ -217,7 +225,7 @@ fn job(arguments: &Arguments) -> anyhow::Result<RenderJob> {
     let mut job = match &arguments.file {
         Some(file) => {
             // with a profile the source is a key in the storage
-            let job = if arguments.profile.is_some() { parse_job(file)? } else { read_job(file)? };
+            let job = if arguments.storage_profile.is_some() { parse_job(file)? } else { read_job(file)? };
             options::check(&job, Some(file))?;
             job
         }
@@ -347,4 +355,20 @@ fn tell(files: &[PathBuf], frame: &Frame, report: &Report, sampling: &Sampling) 
         si(rays as f64),
         report.cpu_s
     ))
+}
+
+/// What each stage cost, of the CPU-seconds of all tasks; without stages that did nothing.
+fn costs(profile: &Profile, busy: f64) -> String {
+    let share = |cpu: f64| if busy > 0.0 { 100.0 * cpu / busy } else { 0.0 };
+    let mut table = format!("{:<9}{:>9}{:>8}{:>10}{:>9}\n", "stage", "CPU-s", "share", "items", "ns each");
+    for part in Part::ALL {
+        let cost = profile.of(part);
+        if cost.items > 0 {
+            let (cpu, items) = (cost.cpu_s, cost.items as f64);
+            let [each, share] = [1e9 * cpu / items, share(cpu)];
+            table += &format!("{:<9}{cpu:>9.3}{share:>7.1}%{:>10}{each:>9.0}\n", part.name(), si(items));
+        }
+    }
+    let rest = (busy - profile.cpu_s()).max(0.0);
+    table + &format!("{:<9}{rest:>9.3}{:>7.1}%\n", "rest", share(rest))
 }

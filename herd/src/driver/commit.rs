@@ -80,6 +80,9 @@ impl<F: FilmSum> Driver<'_, '_, F> {
         self.traffic.add(made_rays.camera, made_rays.closest + made_rays.shadow, self.parts, made.hops, bytes);
         self.hops += made.hops;
         self.skipped += &made.skipped;
+        if let (Some(all), Some(made)) = (&mut self.profile, &made.profile) {
+            *all += made;
+        }
         self.hop_bytes += bytes;
         let film = record.made.film.into_iter().map(|f| (f.key, f.holders));
         if self.is_durable() {

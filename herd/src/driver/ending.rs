@@ -75,6 +75,7 @@ impl<F: FilmSum> Driver<'_, '_, F> {
         };
         report.set_bytes(&bytes);
         report.skips = self.skips();
+        report.profile = self.profile;
         Ok((self.film, spp, report))
     }
 

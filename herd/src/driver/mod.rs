@@ -25,6 +25,7 @@ use crate::local::slots::StopFlag;
 use crate::plan::Window;
 use crate::plan::cost::Traffic;
 use crate::plan::rate::Rate;
+use crate::profile::Profile;
 use crate::report::RayCounts;
 use cameras::Cameras;
 pub use executor::{Event, Executor, FilmSum, Finished, Launch, Objects, Pointer};
@@ -111,6 +112,7 @@ pub struct Driver<'s, 'a, F> {
     hops: u64,
     hop_bytes: u64,
     skipped: SkipCounts,
+    profile: Option<Profile>,
     error: Option<f64>,
     /// When the error that is shown is found again.
     next_error: Instant,
@@ -163,6 +165,7 @@ impl<'s, 'a, F: FilmSum> Driver<'s, 'a, F> {
             hops: 0,
             hop_bytes: 0,
             skipped: SkipCounts::default(),
+            profile: shared.settings.profile.then(Profile::default),
             error: None,
             next_error: Instant::now(),
         }

@@ -66,6 +66,8 @@ pub struct JobSettings {
     pub straggler_seconds: Option<f64>,
     /// Where commits are kept; nowhere if none.
     pub commits: Option<Commits>,
+    /// Whether the report says what each stage of the tasks cost.
+    pub profile: bool,
     /// Faults to inject, for tests.
     pub faults: Option<Faults>,
 }
@@ -88,6 +90,7 @@ impl Default for JobSettings {
             ray_buffer: 64 << 20,
             straggler_seconds: None,
             commits: None,
+            profile: false,
             faults: None,
         }
     }

@@ -1,6 +1,6 @@
 //! One attempt of a task, on the thread of a slot.
 
-use std::cell::OnceCell;
+use std::cell::{OnceCell, RefCell};
 use std::collections::BTreeMap;
 
 use rayherd_render::aov::Aovs;
@@ -16,6 +16,7 @@ use crate::flight::{Flights, PathFlight, ShadowFlight, Visit};
 use crate::job::{JobError, JobSettings, PreparedScene};
 use crate::ledger::{Destination, FilmRef, GroupRef, Outputs};
 use crate::plan::Set;
+use crate::profile::{Clock, Part, Profile};
 use crate::report::Kind;
 use crate::resident::{Lease, Resident, ResidentSurfaces};
 use crate::task::codec;
@@ -51,6 +52,8 @@ pub struct Made {
     pub hops: u64,
     /// What it did not do.
     pub skipped: SkipCounts,
+    /// What its stages cost, if that was asked for.
+    pub profile: Option<Profile>,
 }
 
 /// What all attempts share.
@@ -104,22 +107,27 @@ impl Shared<'_> {
 struct Store<'a> {
     shared: &'a Shared<'a>,
     attempt: &'a Attempt,
+    clock: RefCell<Clock>,
 }
 
 impl GroupSink for Store<'_> {
     fn store(&self, to: Destination, number: u32, rays: &Flights) -> Result<GroupRef, JobError> {
         let key = format!("rays/{}-{}-{number}", self.shared.scene.cut, self.attempt.name);
         let wrong = |source| JobError::Wire { key: key.clone(), source };
+        let mut clock = self.clock.borrow_mut();
+        clock.start();
         let body = ray_group::encode(self.shared.frame, rays).map_err(wrong)?;
         let bytes = body.len() as u64;
         let holders = self.shared.nodes.put(self.attempt.node, Kind::Rays, &key, body)?;
+        clock.lap(Part::Rays, rays.len());
         Ok(GroupRef { key, to, rays: rays.len() as u32, bytes, holders })
     }
 }
 
 /// Runs an attempt to its end.
 pub fn run(shared: &Shared, attempt: &Attempt, stop: &dyn Stop) -> Result<Made, JobError> {
-    let sink = Store { shared, attempt };
+    let clock = || Clock::new(shared.settings.profile);
+    let sink = Store { shared, attempt, clock: RefCell::new(clock()) };
     let mut groups = Groups::new(&sink, shared.settings.ray_buffer);
     let skips = shared.scene.skips();
     let aovs = if skips.makes(Skip::Aovs) { shared.frame.aovs } else { Aovs::ALL };
@@ -131,7 +139,7 @@ pub fn run(shared: &Shared, attempt: &Attempt, stop: &dyn Stop) -> Result<Made, 
         },
     );
     let mut camera = CameraFeed::new(shared.frame, attempt.camera.clone(), skips);
-    let mut trace = Loop::new(shared.settings.kernel, shared.settings.batch as usize, skips)?;
+    let mut trace = Loop::new(shared.settings.kernel, shared.settings.batch as usize, skips, clock())?;
     let tiles = shared.nodes.blocks(attempt.node);
     let slots = shared.settings.nodes[attempt.node as usize].slots;
     let textures = TaskTextures::new(shared.scene, shared.nodes.tiles(attempt.node), &tiles, slots);
@@ -163,10 +171,19 @@ pub fn run(shared: &Shared, attempt: &Attempt, stop: &dyn Stop) -> Result<Made, 
     skipped.add(Skip::Film, (film.tiles() - film.touched()) as u64);
     let hops = if attempt.set == Set::Reduce { 0 } else { groups.rays };
     let rays = trace.rays;
+    let within = sink.clock.borrow().profile();
     let groups = groups.finish()?;
     let non_finite = film.rejected().count;
+    trace.clock.start();
     let (parts, film) = store_film(shared, attempt, film)?;
-    Ok(Made { outputs: Outputs { groups, film: parts, rays, non_finite }, film, hops, skipped })
+    trace.clock.lap(Part::Store, parts.len());
+    let mut profile = trace.clock.profile();
+    if let (Some(all), Some(within), Some(stored)) = (&mut profile, within, sink.clock.borrow().profile()) {
+        // groups that were full went to the store while rays were sent on
+        all.less(Part::Walk, within.cpu_s());
+        *all += &stored;
+    }
+    Ok(Made { outputs: Outputs { groups, film: parts, rays, non_finite }, film, hops, skipped, profile })
 }
 
 /// Stores the film as it is to be; its parts, and itself if it is to be handed over.
@@ -263,7 +280,7 @@ impl<'l> Shading for Lazy<'l> {
     }
 }
 
-impl Task<'_, '_> {
+impl<'a> Task<'a, '_> {
     /// Rays of a few batches: for tasks that hold all that they need, so that no more of them wait in memory than need to.
     fn few(&self) -> usize {
         4 * self.shared.settings.batch as usize
@@ -272,6 +289,14 @@ impl Task<'_, '_> {
     /// Rays that fill the ray buffer: for tasks that go through several splits, each of which is loaded once for all of these.
     fn many(&self) -> usize {
         (self.shared.settings.ray_buffer / size_of::<PathFlight>() as u64).max(1) as usize
+    }
+
+    /// The splits, in memory.
+    fn lease(&mut self, set: &[u32]) -> Result<Lease<'a>, JobError> {
+        self.trace.clock.start();
+        let lease = self.shared.lease(self.attempt.node, set)?;
+        self.trace.clock.lap(Part::Load, set.len());
+        Ok(lease)
     }
 
     /// Hands the input rays over, `least` and at most one group more at a time, and at last what is left, maybe none, for the
@@ -288,7 +313,9 @@ impl Task<'_, '_> {
                 codec::check_rays(self.shared.scene, &rays)?;
                 Ok(rays)
             };
+            self.trace.clock.start();
             let mut rays = self.shared.nodes.get(self.attempt.node, Kind::Rays, &group.key, &group.holders, open)?;
+            self.trace.clock.lap(Part::Rays, rays.len());
             flights.append(&mut rays);
             if flights.len() >= least {
                 each(self, std::mem::take(&mut flights))?;
@@ -299,7 +326,7 @@ impl Task<'_, '_> {
 
     fn resident(&mut self, set: &[u32], groups: &mut Groups) -> Result<(), JobError> {
         let (shared, node, stop) = (self.shared, self.attempt.node, self.stop);
-        let lease = shared.lease(node, set)?;
+        let lease = self.lease(set)?;
         let blocks = shared.nodes.blocks(node);
         let surfaces = Lazy::new(&lease, shared.scene, &blocks)?;
         let (context, grid) = (shared.context(self.textures), &shared.scene.grid);
@@ -330,7 +357,9 @@ impl Task<'_, '_> {
             loop {
                 while queues.len() < limit {
                     made.clear();
+                    t.trace.clock.start();
                     t.camera.fill(&mut made, shared.settings.batch as usize);
+                    t.trace.clock.lap(Part::Camera, made.len());
                     if made.is_empty() {
                         break;
                     }
@@ -341,9 +370,10 @@ impl Task<'_, '_> {
                             None => t.trace.miss(&context, ray, t.film),
                         }
                     }
+                    t.trace.clock.lap(Part::Walk, made.len());
                 }
                 let Some((split, mut flights)) = queues.fullest() else { return Ok(()) };
-                let lease = shared.lease(node, &[split])?;
+                let lease = t.lease(&[split])?;
                 let blocks = shared.nodes.blocks(node);
                 let surfaces = Lazy::new(&lease, shared.scene, &blocks)?;
                 t.trace.run(&context, grid, &lease, &surfaces, &mut flights, &mut none, t.film, &mut queues, stop)?;
@@ -364,7 +394,9 @@ impl Task<'_, '_> {
             loop {
                 let room = limit.saturating_sub(flights.paths.len());
                 let mut made: Vec<PathRay> = Vec::new();
+                t.trace.clock.start();
                 t.camera.fill(&mut made, room);
+                t.trace.clock.lap(Part::Camera, made.len());
                 t.trace.count_camera(made.len() as u64, &context);
                 flights.paths.extend(made.iter().map(|&r| PathFlight::new(r)));
                 if flights.is_empty() {
@@ -375,7 +407,7 @@ impl Task<'_, '_> {
                 let warm = shared.nodes.memory(node).warm();
                 let (held, cold): (Vec<u32>, Vec<u32>) = together.iter().partition(|s| warm.contains(s));
                 for &s in held.iter().chain(&cold) {
-                    let lease = shared.lease(node, &[s])?;
+                    let lease = t.lease(&[s])?;
                     // nothing is shaded here: the hits are decided elsewhere
                     let blocks = shared.nodes.blocks(node);
                     t.unread += Lazy::new(&lease, shared.scene, &blocks)?.unread();
@@ -388,6 +420,9 @@ impl Task<'_, '_> {
                         t.trace.unoccluded(&lease, batch, &mut flights.shadows);
                     }
                 }
+                let asked = flights.len();
+                let mut brought = 0;
+                t.trace.clock.start();
                 for flight in flights.paths.drain(..) {
                     let next = t.trace.next(flight.visit, grid, &flight.bounded(context.skips), &set);
                     let visit = next.map_or(Visit::DECIDED, |n| n.1);
@@ -400,9 +435,12 @@ impl Task<'_, '_> {
                         None => {
                             let light = flight.ray.light();
                             t.film.add(light.pixel, light.sample, light.value);
+                            brought += 1;
                         }
                     }
                 }
+                t.trace.clock.count(Part::Film, brought);
+                t.trace.clock.lap(Part::Walk, asked);
             }
         })
     }
@@ -415,7 +453,7 @@ impl Task<'_, '_> {
         if decided.is_empty() {
             return Ok(());
         }
-        let lease = self.shared.lease(self.attempt.node, &[split])?;
+        let lease = self.lease(&[split])?;
         let blocks = self.shared.nodes.blocks(self.attempt.node);
         let shading = Lazy::new(&lease, self.shared.scene, &blocks)?;
         let surfaces = shading.surfaces()?;
@@ -430,6 +468,8 @@ impl Task<'_, '_> {
     fn reduce(&mut self, groups: &mut Groups) -> Result<(), JobError> {
         let (shared, context) = (self.shared, self.shared.context(self.textures));
         self.inputs(self.few(), |t, mut flights| {
+            t.trace.clock.start();
+            let merged = flights.len();
             flights.paths.sort_by_key(|f| (f.ray.key, f.candidate.t.to_bits(), f.candidate.prim));
             flights.paths.dedup_by_key(|f| f.ray.key);
             for flight in flights.paths.drain(..) {
@@ -444,6 +484,7 @@ impl Task<'_, '_> {
                     t.trace.miss(&context, flight.ray, t.film);
                 }
             }
+            t.trace.clock.lap(Part::Walk, merged);
             Ok(())
         })
     }

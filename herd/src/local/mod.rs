@@ -5,6 +5,8 @@ mod aovs;
 pub mod attempt;
 #[cfg(test)]
 mod closed_forms;
+#[cfg(test)]
+mod costs;
 mod disks;
 pub mod faults;
 mod film;

@@ -86,6 +86,8 @@ pub struct Job<'a> {
     pub band: u32,
     /// Primitives of a scene from which on its blocks are built by all workers ([`super::preparing`]).
     pub apart: u64,
+    /// Whether its reports say what the stages of attempts cost.
+    pub profile: bool,
     /// Where input and output runs; not the caller's thread.
     pub runtime: Handle,
 }
@@ -168,6 +170,7 @@ fn frames(job: &Job, keeper: &Arc<dyn Keeper>, progress: &dyn Progress) -> Resul
             buckets: job.slots.iter().sum(),
             exposure: spec.image.writes(PictureFile::Png).then(|| spec.image.exposure.unwrap_or(0.0)),
             exr: spec.image.writes(PictureFile::Exr),
+            profile: job.profile,
         };
         let (at, mut report) = render(job, keeper, progress, &scene, &stage, places, &sampling, (number, picture))?;
         // known to whoever prepared the scene
@@ -235,6 +238,7 @@ fn render(
         nodes: job.slots.iter().map(|&slots| NodeSpec { slots }).collect(),
         memory_per_node: stage.memory,
         replicas: stage.replicas,
+        profile: stage.profile,
         barrier: job.spec.barrier,
         task_seconds: job.spec.task_seconds.unwrap_or(defaults.task_seconds),
         ..defaults

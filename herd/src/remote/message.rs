@@ -10,6 +10,7 @@ use serde::{Deserialize, Serialize};
 use crate::job::JobError;
 use crate::ledger::{FilmRef, Outputs};
 use crate::local::attempt::Attempt;
+use crate::profile::Profile;
 use crate::report::BytesRow;
 
 /// Which worker speaks.
@@ -114,6 +115,9 @@ pub struct Stage {
     /// Whether the EXR is kept.
     #[serde(default = "yes")]
     pub exr: bool,
+    /// Whether workers tell what the stages of attempts cost.
+    #[serde(default)]
+    pub profile: bool,
 }
 
 /// Operators of versions that know no choice want the EXR.
@@ -295,6 +299,9 @@ pub enum Done {
         /// What it did not do.
         #[serde(default)]
         skipped: SkipCounts,
+        /// What its stages cost, if the stage asks for it.
+        #[serde(default, skip_serializing_if = "Option::is_none")]
+        profile: Option<Profile>,
     },
     /// Of a merge.
     Merged {

@@ -234,6 +234,7 @@ impl<'l> Station<'l> {
             nodes: vec![NodeSpec { slots: self.slots }; disks as usize + 1],
             memory_per_node: stage.memory,
             replicas: stage.replicas,
+            profile: stage.profile,
             ..JobSettings::default()
         };
         let part = Arc::new(self.depot.part(&stage.prefix, stage.replicas)?);
@@ -387,7 +388,8 @@ impl<'l> Station<'l> {
                 let (_, shared) = open()?;
                 let attempt = Attempt { node: self.node(), ..attempt.clone() };
                 let made = attempt::run(shared, &attempt, stop)?;
-                Ok(Done::Made { outputs: made.outputs, hops: made.hops, skipped: made.skipped })
+                let attempt::Made { outputs, hops, skipped, profile, .. } = made;
+                Ok(Done::Made { outputs, hops, skipped, profile })
             }
             Work::Merge { name, parts, spp, picture, band } => {
                 let (stage, shared) = open()?;

@@ -27,6 +27,7 @@ use super::{Depot, Fleet, Link, LinkError, Station, Turns};
 use crate::driver::{Event, Executor};
 use crate::job::{JobError, JobSettings, PreparedScene, Sampling, Silent, spec as from_spec};
 use crate::local::{journal, render_local};
+use crate::profile::Part;
 use crate::report;
 use crate::store::{BlockStore, FaultPlan, Faulty, MemoryStore, Patience, SceneObjects, Watched, object_key};
 use crate::{picture, png_file, scenes};
@@ -183,6 +184,8 @@ struct Cluster {
     band: u32,
     /// Primitives from which on all workers build a scene.
     apart: u64,
+    /// Whether the reports say what the stages of attempts cost.
+    profile: bool,
 }
 
 impl Cluster {
@@ -191,7 +194,7 @@ impl Cluster {
         let memory = || Arc::new(Faulty::new(Arc::new(MemoryStore::default()), FaultPlan::default()));
         let stores = (0..nodes).map(|_| memory()).collect();
         let (scratch, turns) = (tempfile::tempdir().unwrap(), Turns::default());
-        let cluster = Cluster { stores, runtime, scratch, turns, band: BAND, apart: APART };
+        let cluster = Cluster { stores, runtime, scratch, turns, band: BAND, apart: APART, profile: false };
         cluster.runtime.block_on(cluster.stores[0].put(SOURCE, CORNELL.clone().into())).unwrap();
         cluster.runtime.block_on(cluster.stores[0].put(TEXTURE, wall().into())).unwrap();
         cluster
@@ -213,6 +216,7 @@ impl Cluster {
             slots: vec![1; 3],
             band: self.band,
             apart: self.apart,
+            profile: self.profile,
             runtime: self.runtime.handle().clone(),
         }
     }
@@ -322,7 +326,8 @@ fn every_strategy_makes_the_bytes_of_a_local_run() {
         let mut spec = spec(strategy, splits, 2);
         spec.image.aovs = spec.image.aovs.filter(|_| layers);
         spec.workers.memory = memory.map(|m: &str| m.parse().unwrap());
-        let (cluster, kept) = (Cluster { band, ..Cluster::new(2) }, Arc::new(Kept::default()));
+        let profile = splits > 1;
+        let (cluster, kept) = (Cluster { band, profile, ..Cluster::new(2) }, Arc::new(Kept::default()));
         if let Err(e) = cluster.render(&spec, &kept) {
             panic!("{strategy}: {e}");
         }
@@ -336,6 +341,10 @@ fn every_strategy_makes_the_bytes_of_a_local_run() {
         let reports = kept.reports.lock().unwrap();
         assert!(reports[0].tasks > 1 && reports[0].scene_passes > 0.0, "{:?}", reports[0]);
         assert_eq!(kept.pictures.lock().unwrap()[0].len(), 2);
+        // what workers spent, of those of committed attempts, comes with their results
+        let costs = reports[0].profile.map(|p| [Part::Shading, Part::Shadow].map(|part| p.of(part).items));
+        assert_eq!(costs.is_some(), profile, "{strategy}");
+        assert!(costs.is_none_or(|c| c[0] == reports[0].rays.closest && c[1] >= reports[0].rays.shadow), "{strategy}");
     }
 }
 

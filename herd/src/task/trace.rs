@@ -13,6 +13,7 @@ use rayherd_scene::grid::{Grid, SplitSet};
 use super::CameraFeed;
 use crate::flight::{Candidate, Flights, PathFlight, ShadowFlight, Visit};
 use crate::job::JobError;
+use crate::profile::{Clock, Part};
 use crate::report::RayCounts;
 use crate::resident::Resident;
 
@@ -63,6 +64,8 @@ pub struct Loop {
     batch: usize,
     /// Rays that were made and traced here; a ray is counted by the task that makes it.
     pub rays: RayCounts,
+    /// What its stages cost, if that was asked for.
+    pub clock: Clock,
     rays_in: Vec<Ray>,
     hits: Vec<Hit>,
     occluded: Vec<bool>,
@@ -75,11 +78,12 @@ pub struct Loop {
 
 impl Loop {
     /// A loop that traces `batch` rays together, or 1 or [`MOST`] if it is out of this range.
-    pub fn new(kernel: Kernel, batch: usize, skips: Skips) -> Result<Self, UnsupportedKernel> {
+    pub fn new(kernel: Kernel, batch: usize, skips: Skips, clock: Clock) -> Result<Self, UnsupportedKernel> {
         Ok(Loop {
             tracer: Tracer::new(kernel)?,
             batch: batch.clamp(1, MOST),
             rays: RayCounts::default(),
+            clock,
             rays_in: Vec::new(),
             hits: Vec::new(),
             occluded: Vec::new(),
@@ -122,25 +126,30 @@ impl Loop {
         loop {
             stop.check()?;
             self.skipped.add(Skip::Walk, self.outcome.shadow.len() as u64);
+            self.clock.start();
             self.occlude(resident, film);
             let from = pending.len().saturating_sub(self.batch);
             let waiting = pending.len();
             camera.fill_traced(&mut pending, &mut rays, from + self.batch);
             self.count_camera((pending.len() - waiting) as u64, context);
+            self.clock.lap(Part::Camera, pending.len() - waiting);
             if pending.is_empty() {
                 return Ok(());
             }
             self.hits.resize(pending.len() - from, Hit::miss(0.0));
             self.tracer.closest(forest, &rays[from..], &mut self.hits);
+            self.clock.lap(Part::Closest, self.hits.len());
             self.skipped.add(Skip::Walk, self.hits.len() as u64);
             let (paths, traced, hits, out) = (&pending[from..], &rays[from..], &self.hits, &mut self.outcome);
             if hits.iter().any(Hit::is_hit) {
                 let surfaces = shading.surfaces()?;
+                self.clock.lap(Part::Load, 0);
                 shade_traced(context, surfaces, paths, traced, hits, out);
                 beside_light(context, surfaces, paths, hits, out, film, &mut self.skipped);
             } else {
                 shade_traced(context, &NoSurfaces, paths, traced, hits, out);
             }
+            self.clock.lap(Part::Shading, paths.len());
             pending.truncate(from);
             rays.truncate(from);
             self.collect(film);
@@ -151,7 +160,9 @@ impl Loop {
 
     /// Adds what was shaded to the film, and counts the rays that it made.
     fn collect(&mut self, film: &mut BoundedFilm) {
+        let items = self.outcome.light.len();
         film.add_all(self.outcome.light.drain(..).map(|l| (l.pixel, l.sample, l.value)));
+        self.clock.lap(Part::Film, items);
         self.rays.closest += self.outcome.next.len() as u64;
         self.rays.shadow += self.outcome.shadow.len() as u64;
     }
@@ -161,8 +172,10 @@ impl Loop {
         let (shadows, rays) = (&mut self.outcome.shadow, &mut self.outcome.shadow_rays);
         self.occluded.resize(shadows.len(), false);
         self.tracer.any(resident.forest(), rays, &mut self.occluded);
+        self.clock.lap(Part::Shadow, shadows.len());
         let seen = shadows.iter().zip(&self.occluded).filter(|(_, occluded)| !**occluded);
         film.add_all(seen.map(|(s, _)| (s.key.pixel, s.key.sample, s.contribution)));
+        self.clock.lap(Part::Film, self.occluded.iter().filter(|occluded| !**occluded).count());
         shadows.clear();
         rays.clear();
     }
@@ -195,8 +208,10 @@ impl Loop {
             current.extend(flights.paths.drain(from..));
             if current.is_empty() {
                 made.clear();
+                self.clock.start();
                 camera.fill(&mut made, self.batch);
                 self.count_camera(made.len() as u64, context);
+                self.clock.lap(Part::Camera, made.len());
                 current.extend(made.iter().map(|&r| PathFlight::new(r)));
             }
             if current.is_empty() && flights.shadows.is_empty() {
@@ -219,13 +234,16 @@ impl Loop {
                     ready_hits.push(*hit);
                 }
             }
+            self.clock.lap(Part::Walk, current.len());
             if ready_hits.iter().any(Hit::is_hit) {
                 let (surfaces, out) = (shading.surfaces()?, &mut self.outcome);
+                self.clock.lap(Part::Load, 0);
                 shade(context, surfaces, &ready, &ready_hits, out);
                 beside_light(context, surfaces, &ready, &ready_hits, out, film, &mut self.skipped);
             } else {
                 shade(context, &NoSurfaces, &ready, &ready_hits, &mut self.outcome);
             }
+            self.clock.lap(Part::Shading, ready.len());
             self.collect(film);
             self.take_spawned(flights);
         }
@@ -234,6 +252,7 @@ impl Loop {
     /// Traces a batch and updates its candidates. Afterwards a hit is one of `self.hits` when the candidate is here, and a
     /// miss when there is none or it is elsewhere.
     pub fn closest(&mut self, resident: &Resident, batch: &mut [PathFlight]) {
+        self.clock.start();
         self.rays_in.clear();
         let skips = self.skips;
         self.rays_in.extend(batch.iter().map(|f| f.bounded(skips)));
@@ -258,12 +277,16 @@ impl Loop {
         if skips.makes(Skip::Beaten) {
             self.skipped.add(Skip::Beaten, beaten);
         }
+        self.clock.lap(Part::Closest, batch.len());
     }
 
-    /// Ends a path that leaves the scene.
+    /// Ends a path that leaves the scene. Its time is the caller's: a clock for one ray would cost as much as the ray.
     pub fn miss(&mut self, context: &Context, ray: PathRay, film: &mut BoundedFilm) {
         shade(context, &NoSurfaces, &[ray], &[Hit::miss(f32::INFINITY)], &mut self.outcome);
-        self.collect(film);
+        self.clock.count(Part::Shading, 1);
+        self.clock.count(Part::Film, self.outcome.light.len());
+        // nothing was hit, so nothing goes on
+        film.add_all(self.outcome.light.drain(..).map(|l| (l.pixel, l.sample, l.value)));
     }
 
     /// Traces shadow rays: those that pass go on, or bring their light.
@@ -275,10 +298,13 @@ impl Loop {
         film: &mut BoundedFilm,
         outbox: &mut dyn Outbox,
     ) -> Result<(), JobError> {
+        self.clock.start();
         self.occluded.resize(batch.len(), false);
         self.rays_in.clear();
         self.rays_in.extend(batch.iter().map(|f| f.ray.ray()));
         self.tracer.any(resident.forest(), &self.rays_in, &mut self.occluded);
+        self.clock.lap(Part::Shadow, batch.len());
+        let mut brought = 0;
         for (i, flight) in batch.iter().enumerate() {
             if self.occluded[i] {
                 continue;
@@ -288,17 +314,22 @@ impl Loop {
             } else {
                 let light = flight.ray.light();
                 film.add(light.pixel, light.sample, light.value);
+                brought += 1;
             }
         }
+        self.clock.count(Part::Film, brought);
+        self.clock.lap(Part::Walk, self.occluded.iter().filter(|occluded| !**occluded).count());
         Ok(())
     }
 
     /// Keeps the shadow rays that nothing here is in the way of.
     pub fn unoccluded(&mut self, resident: &Resident, batch: &[ShadowFlight], out: &mut Vec<ShadowFlight>) {
+        self.clock.start();
         self.occluded.resize(batch.len(), false);
         self.rays_in.clear();
         self.rays_in.extend(batch.iter().map(|f| f.ray.ray()));
         self.tracer.any(resident.forest(), &self.rays_in, &mut self.occluded);
+        self.clock.lap(Part::Shadow, batch.len());
         out.extend(batch.iter().zip(&self.occluded).filter(|(_, o)| !**o).map(|(f, _)| *f));
     }
 
@@ -319,6 +350,7 @@ impl Loop {
         }
         shade(context, surfaces, &rays, &self.hits, &mut self.outcome);
         beside_light(context, surfaces, &rays, &self.hits, &self.outcome, film, &mut self.skipped);
+        self.clock.lap(Part::Shading, rays.len());
         self.collect(film);
         self.take_spawned(out);
         Ok(())

@@ -294,9 +294,9 @@ impl State {
     /// What an attempt's result means to the loop over rounds.
     pub fn judge(&mut self, result: Result<Done, Failure>) -> Result<Made, JobError> {
         match result {
-            Ok(Done::Made { outputs, hops, skipped }) => {
+            Ok(Done::Made { outputs, hops, skipped, profile }) => {
                 self.succeeded();
-                Ok(Made { outputs, film: None, hops, skipped })
+                Ok(Made { outputs, film: None, hops, skipped, profile })
             }
             Ok(_) => Err(JobError::Internal("a worker reports something else than it was to do".into())),
             Err(Failure::Stopped) => Err(JobError::Stopped),

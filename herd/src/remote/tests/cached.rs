@@ -185,6 +185,7 @@ fn what_a_worker_has_cached_makes_it_a_holder_and_is_read_from_s3_no_more() {
             band: BAND,
             exposure: None,
             exr: true,
+            profile: false,
         };
         let holders = || -> Vec<Vec<u32>> { fleet.holders().unwrap().into_iter().take(4).collect() };
         // a worker tells what it holds when it asks for more, which is after its result
@@ -250,6 +251,7 @@ fn of_what_a_cache_holds_the_latest_word_counts() {
             band: BAND,
             exposure: None,
             exr: true,
+            profile: false,
         };
         fleet.open(stage, vec![vec![0]; 4], 0);
     };
