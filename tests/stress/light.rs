@@ -94,6 +94,46 @@ fn square_lamps_of_every_size_give_what_they_should() {
     }
 }
 
+/// A sphere fills (r / d)^2 of what a point sees of its half space, cosines counted, whatever its size: here one unit away, or a thousandth of its radius
+/// where f32 has no smaller step that a picture could stand on.
+#[test]
+fn sphere_lamps_of_every_size_give_what_they_should() {
+    for r in [1e-6, 1e-4, 1e-2, 1.0, 10.0, 1e3, 1e4, 1e6] {
+        let gap = f64::max(1.0, 1e-3 * r);
+        let radiance = ((r + gap) / r).powi(2);
+        let mut lamp = shape(&[], 1, Some([radiance as f32; 3]));
+        lamp.geometry = Geometry::Sphere { center: [0.0, r + gap, 0.0], radius: r };
+        let floor = shape(&square([0.0, 0.0, 0.0], gap, true), 0, None);
+        let description =
+            Description { materials: vec![diffuse(0.5), diffuse(0.0)], ..scenes::under_a_sky(vec![floor, lamp], None) };
+        let shot = down(1e-4 * gap, 0.5 * gap, 0.0);
+        let (found, error) = mean(&taken(&description, &shot), shot.spp);
+        println!("radius {r}: {found}, four standard errors {error}");
+        assert!((found / 0.5 - 1.0).abs() < error.max(2e-3), "radius {r}: {found} +- {error}");
+    }
+}
+
+/// Samples of one pixel: the environment says how many, else as many as take a moment.
+fn samples() -> u32 {
+    match std::env::var("RAYHERD_STRESS_SAMPLES") {
+        Ok(text) => {
+            text.parse().unwrap_or_else(|_| panic!("RAYHERD_STRESS_SAMPLES is {text:?}: give a number of samples"))
+        }
+        Err(_) => 1 << 18,
+    }
+}
+
+/// A third is no binary fraction: sums in f32 of it stall long before the most samples that a pixel may have (2^24). The picture's are exact.
+#[test]
+fn one_pixel_of_very_many_samples_is_exact() {
+    let behind = shape(&square([0.0, 9.0, 0.0], 1e-3, true), 0, None);
+    let description = scenes::under_a_sky(vec![behind], Some([1.0 / 3.0; 3]));
+    let spp = samples();
+    let film = taken(&description, &Shot { size: [1, 1], fov: 60.0, spp, ..down(0.0, 0.0, 0.0) });
+    assert_eq!((film.resolve(spp), film.rejected().count), (vec![[1.0f32 / 3.0; 3]], 0));
+    println!("{spp} samples of a third: exactly a third");
+}
+
 /// Two rooms with one wall between: in one a lamp a billion times as bright as in the other. Each room has what its lamp gives.
 #[test]
 fn a_billion_to_one() {

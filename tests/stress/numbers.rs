@@ -15,6 +15,12 @@ pub fn rays(least: u64) -> u64 {
     }
 }
 
+/// How many of a batch the plain kernel takes, in a test of `total` rays: all, or beyond a million one of 64. It is slow, and gives the same bits as the
+/// others elsewhere.
+pub fn plain_share(total: u64, batch: usize) -> usize {
+    if total > 1_000_000 { batch.div_ceil(64) } else { batch }
+}
+
 /// In [0, 1), a multiple of 2^-24.
 pub fn unit(random: &mut Random) -> f32 {
     (random.bits() >> 40) as f32 / (1 << 24) as f32
