@@ -46,7 +46,7 @@ pub fn open(
         tracing::warn!("{}: {} is not supported; in its place: {}", s.place, s.what, s.stand_in);
     }
     for note in &description.notes {
-        tracing::info!("{}: {}", note.place, note.text);
+        tracing::warn!("{}: {}", note.place, note.text);
     }
     let source = DescriptionSource::new(&description, StreamOptions { skips, ..StreamOptions::default() });
     let progress = StageBar::new();

@@ -306,6 +306,13 @@ fn cycles_and_references_to_nothing() {
                  <shape type='cube'><ref id='a'/></shape>{LIT}"
             ),
         )
+        .xml(
+            "group.xml",
+            &format!(
+                "<shape type='shapegroup' id='g'><shape type='cube'/>\n<shape type='instance'><ref id='g'/></shape></shape>\
+                 <shape type='instance'><ref id='g'/></shape>{LIT}"
+            ),
+        )
         .xml("nothing.xml", &format!("<shape type='cube'>\n<ref id='no'/></shape>{LIT}"))
         .xml("twice.xml", &format!("<bsdf type='diffuse' id='m'/>\n<bsdf type='diffuse' id='m'/>{LIT}"))
         .write("beyond.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\nf 1 2 4\n")
@@ -323,6 +330,7 @@ fn cycles_and_references_to_nothing() {
         ("render one.xml", &["two.xml:2", "cycle: one.xml -> two.xml -> one.xml"]),
         ("render ref.xml", &["ref.xml:2", "cycle"]),
         ("render pair.xml", &["pair.xml", "cycle"]),
+        ("render group.xml", &["group.xml:3", "cycle through \"g\""]),
         ("render nothing.xml", &["nothing.xml:3", "ref to \"no\"", "nothing in the scene has this id"]),
         ("render twice.xml", &["twice.xml:3", "id \"m\" is taken", "its own"]),
         ("render beyond.obj", &["beyond.obj:5", "index 4 of v, but 3"]),
@@ -337,6 +345,17 @@ fn cycles_and_references_to_nothing() {
 #[test]
 fn nothing_to_see_or_to_see_by() {
     let bed = Bed::new();
+    let film = |n: u32| {
+        format!(
+            "<sensor type='perspective'><film type='hdrfilm'><integer name='width' value='{n}'/><integer name='height' value='{n}'/>\
+             </film></sensor><shape type='cube'/>{LIT}"
+        )
+    };
+    let rough = |alpha: &str| {
+        format!(
+            "<shape type='cube'><bsdf type='roughconductor'><float name='alpha' value='{alpha}'/></bsdf></shape>{LIT}"
+        )
+    };
     bed.write("nan.obj", "v nan 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
         .write("inf.obj", "v inf 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
         .write("flat.obj", "v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\nf 1 1 2\n")
@@ -353,6 +372,11 @@ fn nothing_to_see_or_to_see_by() {
             "nan.xml",
             &format!("<shape type='cube'>\n<transform name='to_world'><scale value='nan'/></transform></shape>{LIT}"),
         )
+        .xml("film-0.xml", &film(0))
+        .xml("film-large.xml", &film(100_000))
+        .write("t.obj", TRIANGLE)
+        .xml("rough.xml", &rough("-1"))
+        .xml("rough-nan.xml", &rough("NaN").replace("NaN", "nan"))
         .xml("line-light.xml", {
             "<shape type='cube'/><shape type='rectangle' id='lamp'>\n<transform name='to_world'><scale x='0'/></transform>\
              <emitter type='area'/></shape>"
@@ -374,6 +398,12 @@ fn nothing_to_see_or_to_see_by() {
         ("render line-light.xml", &["line-light.xml:2", "\"lamp\" emits, but has no area", "--light or --sky"]),
         ("render even.nrrd --iso 5", &["even.nrrd", "both sides of the iso value"]),
         ("render even.nrrd --iso nan", &["iso"]),
+        ("render film-0.xml", &["film-0.xml:2", "width 0 should lie between 1 and 65535"]),
+        ("render film-large.xml", &["film-large.xml:2", "width 100000 should lie between 1 and 65535"]),
+        ("render t.obj --size 0x0", &["0x0", "--size"]),
+        ("render t.obj --size 100000x100000", &["100000x100000", "--size"]),
+        ("render rough.xml", &["rough.xml:2", "roughness [-1.0, -1.0] should lie in (0, 1]"]),
+        ("render rough-nan.xml", &["rough-nan.xml:2", "\"nan\" is not finite"]),
     ]);
 
     // without a camera a scene is framed; what is unusable is skipped, counted and reported
@@ -405,6 +435,54 @@ fn nothing_to_see_or_to_see_by() {
         (report["skipped"]["degenerate"].as_u64(), report["skipped"]["non_finite"].as_u64()),
         (Some(1), Some(1))
     );
+}
+
+/// A camera inside of a wall is a black picture and no error: it is told, with the shape and what to do. So is any other black picture, and a shape that
+/// its transform flattens. A picture is what its content says, whatever it is called.
+#[test]
+fn what_is_odd_is_told() {
+    let bed = Bed::new();
+    let sensor = "<sensor type='perspective'><transform name='to_world'><lookat origin='0, 0, 0' target='0, 0, 1' up='0, 1, 0'/>\
+                  </transform></sensor>";
+    let cube = |bsdf: &str| format!("{sensor}\n<shape type='cube' id='wall'>{bsdf}</shape>{LIT}");
+    let away = "<shape type='rectangle'><transform name='to_world'><translate z='5'/></transform></shape>";
+    bed.xml("wall.xml", &cube(""))
+        .xml("room.xml", &cube("<bsdf type='twosided'><bsdf type='diffuse'/></bsdf>"))
+        .xml("black.xml", &format!("{}{away}", cube("<bsdf type='diffuse'><rgb name='reflectance' value='0'/></bsdf><boolean name='flip_normals' value='true'/>")))
+        .xml("flat.xml", &format!("<shape type='cube'/>\n<shape type='sphere'/><shape type='cube'>\n<transform name='to_world'><scale value='0'/></transform></shape>{LIT}"))
+        .xml("sheet.xml", &format!("<shape type='rectangle'><transform name='to_world'><scale x='2' y='2' z='0'/></transform></shape>{LIT}"));
+    let render = |name: &str| bed.line(&format!("render {name} --spp 1 --size 8x8"));
+    let (run, checked) = (render("wall.xml"), bed.line("check wall.xml"));
+    for run in [&run, &checked] {
+        assert_eq!(run.code, 0, "{}", run.err);
+        for part in ["wall.xml:3", "\"wall\"", "one-sided", "--camera", "twosided"] {
+            assert!(run.err.contains(part), "no {part:?} in {}", run.err);
+        }
+    }
+    assert!(run.err.contains("wall.exr is black") && checked.err.contains("warning: "), "{}{}", run.err, checked.err);
+    let run = render("wall.xml --camera 0,0,5,0,0,0,0,1,0,40");
+    assert!(run.code == 0 && run.err.is_empty(), "from outside: {}", run.err);
+    let (run, checked) = (render("room.xml"), bed.line("check room.xml"));
+    assert!(!run.err.contains("one-sided") && checked.err.is_empty(), "{}{}", run.err, checked.err);
+    let (run, checked) = (render("black.xml"), bed.line("check black.xml"));
+    assert!(run.code == 0 && run.err.contains("black.exr is black: no light reached the camera"), "{}", run.err);
+    assert!(!run.err.contains("one-sided") && checked.err.is_empty(), "{}{}", run.err, checked.err);
+    let (run, checked) = (render("flat.xml"), bed.line("check flat.xml"));
+    for run in [&run, &checked] {
+        assert!(run.code == 0 && run.err.contains("flat.xml:3: to_world flattens this shape \"cube\""), "{}", run.err);
+    }
+    let run = render("sheet.xml");
+    assert!(run.code == 0 && run.err.is_empty(), "{}", run.err);
+
+    let mut png = vec![];
+    let mut encoder = png::Encoder::new(&mut png, 1, 1);
+    encoder.set_color(png::ColorType::Rgb);
+    encoder.write_header().unwrap().write_image_data(&[255, 0, 0]).unwrap();
+    let textured = "<shape type='cube'><bsdf type='diffuse'><texture type='bitmap' name='reflectance'><string name='filename' value='red.jpg'/>\
+                    </texture></bsdf></shape>";
+    bed.write("red.jpg", png).xml("lying.xml", &format!("{textured}{LIT}"));
+    let run = render("lying.xml");
+    assert!(run.code == 0 && run.err.is_empty(), "a PNG named .jpg: {}", run.err);
 }
 
 /// Files that a scene must not read, and things that are no files.

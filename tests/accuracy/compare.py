@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+import features
 import scenes
 
 
@@ -39,16 +40,16 @@ def main() -> int:
     mi.set_variant("llvm_ad_rgb")
     failed = 0
     print(f"{'scene':20} {'ch':2} {'rayherd':>10} {'mitsuba':>10} {'difference':>10} {'3 s.e.':>8}  tiles > 4 s.e.  verdict")
-    groups = {"materials": scenes.MATERIALS, "emitters": scenes.EMITTERS}
+    groups = {"materials": scenes.MATERIALS, "emitters": scenes.EMITTERS, "features": features.FEATURES}
     names = [n for name in a.names for n in groups.get(name, [name])]
     for name in names:
-        xml = scenes.prepare(name, a.shared.resolve(), a.work.resolve(), a.rayherd)
+        xml = scenes.prepare(name, a.shared.resolve(), a.work.resolve(), a.rayherd, a.size)
         scene = mi.load_file(str(scenes.read_by_mitsuba(xml)), **scenes.parameters(xml, a.size, a.max_depth))
         spp, renders = (64, 8) if a.quick else scenes.ENOUGH.get(name, (256, 16))
         spp, renders = a.spp or spp, a.renders or renders
         theirs, ours = [], []
         for i in range(renders):
-            theirs.append(np.array(mi.render(scene, spp=spp, seed=1000 + i), dtype=np.float64))
+            theirs.append(np.array(mi.render(scene, spp=spp, seed=1000 + i), dtype=np.float64)[..., :3])
             out = a.work / f"{name}-{i}.exr"
             command = [a.rayherd, "render", str(xml), "--size", f"{a.size}x{a.size}", "--spp", str(spp), "--seed", str(i),
                        "--max-depth", str(a.max_depth), "-o", str(out)]

@@ -5,7 +5,7 @@ import sys
 import tarfile
 from pathlib import Path
 
-NAMES = ["cornell", "veach-mis", "gyroid", "staircase", "living-room", "classroom", "dining-room", "furnace", "ajar-door", "still-life", "house"]
+NAMES = ["cornell", "cornell-box", "veach-mis", "gyroid", "staircase", "living-room", "classroom", "dining-room", "furnace", "ajar-door", "still-life", "house"]
 # of ../../examples; house is made by `rayherd scene house`
 OURS = ["furnace", "ajar-door", "still-life"]
 # of `rayherd scene many-lights`: how many lamps
@@ -175,43 +175,37 @@ def sheet() -> str:
     return "\n".join(out) + "\n"
 
 
-def prepare(name: str, shared: Path, work: Path, rayherd: str = "rayherd") -> Path:
-    """Leaves the scene under `work` and returns its XML. Parameters: res (or resx, resy), spp, max_depth."""
+def prepare(name: str, shared: Path, work: Path, rayherd: str = "rayherd", size: int = 128) -> Path:
+    """Leaves the scene under `work` and returns its XML. Parameters: res (or resx, resy), spp, max_depth; `size` is that of the picture where a
+    parameter cannot say it."""
+    import features
+
+    if name in features.FEATURES:
+        features.write_files(work)
+        (work / "sky.hdr").write_bytes(sky())
+        out = work / f"feature-{name}.xml"
+        out.write_text(features.text(name, size))
+        return out
     if name == "cornell":
         out = work / "cornell.xml"
         out.write_text((shared / "peers/refs/cornell.xml").read_text())
         return out
-    if name == "veach-mis":
-        with tarfile.open(shared / "data/scene-veach-mis/scene-veach-mis.tar.xz") as tar:
-            tar.extractall(work / "veach-mis", filter="data")
-        source = next((work / "veach-mis").rglob("scene.xml"))
+    if name in ["cornell-box", "veach-mis"]:
+        with tarfile.open(shared / f"data/scene-{name}/scene-{name}.tar.xz") as tar:
+            tar.extractall(work / name, filter="data")
+        source = next((work / name).rglob("scene.xml"))
         text = source.read_text()
         text = text.replace('value="path_guiding_integrator"', 'value="path"')
         text = re.sub(r'<rfilter type="\w+"', '<rfilter type="box"', text)
         out = source.with_name("scene-box.xml")
-        out.write_text(moved(text, VEACH_SHIFT))
+        out.write_text(moved(text, VEACH_SHIFT) if name == "veach-mis" else text)
         return out
     if name in ROOMS:
         with tarfile.open(shared / f"data/scene-{name}/scene-{name}.tar.xz") as tar:
             tar.extractall(work / name, filter="data")
         source = next((work / name).rglob(ROOMS[name]))
-        text = source.read_text()
-        text = re.sub(r'type="(tent|gaussian)"', 'type="box"', text)
-        # photon maps
-        text = text.replace('name="method" value="sppm"', 'name="method" value="path"')
-        text = re.sub(r'<\w+ name="(photonCount|maxPasses|stepSnapshot|kNN|dualBuffer)"[^>]*/>', "", text)
-        text = re.sub(r'<boolean name="banner"[^>]*/>|<float name="gamma" value="2.2" */>', "", text)
-        text = re.sub(r'(name="(?:width|height)" value=)"\d+"', r'\1"$res"', text)
-        text = re.sub(r'(name="maxDepth" value=)"-?\d+"', r'\1"$max_depth"', text)
-        # Mitsuba 3 refuses what it does not know
-        text = re.sub(r'<boolean name="(?:highQualityEdges|high_quality_edges)"[^>]*/>', "", text)
-        defaults = '<default name="res" value="128"/><default name="max_depth" value="65"/>'
-        out = source.with_name("scene-box.xml")
-        text = re.sub(r"(<scene[^>]*>)", r"\1" + defaults, text, count=1)
-        out.write_text(text)
-        if "sunsky" in text:
-            theirs(out).write_text(for_mitsuba(text))
-        return out
+        text = re.sub(r'type="(tent|gaussian)"', 'type="box"', source.read_text())
+        return write_room(text, source.with_name("scene-box.xml"))
     if name == "gyroid":
         out = work / "scenes/gyroid.xml"
         if not out.exists():  # 1,002,500 triangles
@@ -242,8 +236,27 @@ def prepare(name: str, shared: Path, work: Path, rayherd: str = "rayherd") -> Pa
         # a scale of the map is the width of a parallel view; a perspective one has none
         out.write_text(text if sensor == "orthographic" else text.replace('<scale x="2" y="2"/>', ""))
         return out
-    there = ", ".join([*NAMES, *MANY_LIGHTS, *MATERIALS, *EMITTERS])
-    raise SystemExit(f"unknown scene {name}; there are {there}; materials or emitters for all of these")
+    there = ", ".join([*NAMES, *MANY_LIGHTS, *MATERIALS, *EMITTERS, *features.FEATURES])
+    raise SystemExit(f"unknown scene {name}; there are {there}; materials, emitters or features for all of these")
+
+
+def write_room(text: str, out: Path, side: tuple[str, str] = ("$res", "$res")) -> Path:
+    """Writes a room of shared/data as both renderers read it, with a film of these sides."""
+    # photon maps
+    text = text.replace('name="method" value="sppm"', 'name="method" value="path"')
+    text = re.sub(r'<\w+ name="(photonCount|maxPasses|stepSnapshot|kNN|dualBuffer)"[^>]*/>', "", text)
+    text = re.sub(r'<boolean name="banner"[^>]*/>|<float name="gamma" value="2.2" */>', "", text)
+    for name, length in zip(["width", "height"], side):
+        text = re.sub(rf'(name="{name}" value=)"\d+"', rf'\1"{length}"', text)
+    text = re.sub(r'(name="maxDepth" value=)"-?\d+"', r'\1"$max_depth"', text)
+    # Mitsuba 3 refuses what it does not know
+    text = re.sub(r'<boolean name="(?:highQualityEdges|high_quality_edges)"[^>]*/>', "", text)
+    defaults = '<default name="res" value="128"/><default name="max_depth" value="65"/>'
+    text = re.sub(r"(<scene[^>]*>)", r"\1" + defaults, text, count=1)
+    out.write_text(text)
+    if "sunsky" in text:
+        theirs(out).write_text(for_mitsuba(text))
+    return out
 
 
 def moved(text: str, dx: float) -> str:

@@ -47,6 +47,7 @@ pub fn run(arguments: &Arguments) -> anyhow::Result<ExitCode> {
     }
     print(&text)?;
     description.notes.iter().for_each(|note| eprintln!("{}: {}", note.place, note.text));
+    survey.walled_in.iter().for_each(|text| eprintln!("warning: {text}"));
     problems.iter().for_each(|p| eprintln!("{p}"));
     if problems.is_empty() {
         return Ok(ExitCode::SUCCESS);

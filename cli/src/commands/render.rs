@@ -1,7 +1,7 @@
 //! `rayherd render`: from a scene to an EXR and a PNG.
 
 use std::num::NonZeroU32;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
 use anyhow::Context;
@@ -15,6 +15,7 @@ use rayherd_herd::profile::{Part, Profile};
 use rayherd_herd::report::{Kind, Op, Report};
 use rayherd_render::frame::Frame;
 use rayherd_render::skip::Skip;
+use rayherd_scene::import::{Sight, import};
 use rayherd_scene::prepare::{ByteKind, ByteOp, ByteRow, Prepared};
 use serde_json::json;
 
@@ -205,6 +206,9 @@ pub fn run(arguments: &Arguments) -> anyhow::Result<ExitCode> {
             None => saved?,
         }
         tell(&shot.written(&job.spec.image), &shot.frame, &outcome.report, &sampling)?;
+        if outcome.image.pixels.iter().all(|pixel| *pixel == [0.0; 3]) {
+            tracing::warn!("{} is black: {}", shot.exr.display(), why_black(&job.spec, shot, prepared.manifest.offset));
+        }
         if let Some(profile) = &outcome.report.profile {
             print(&costs(profile, outcome.report.nodes_detail.iter().map(|n| n.busy).sum()))?;
         }
@@ -218,6 +222,19 @@ pub fn run(arguments: &Arguments) -> anyhow::Result<ExitCode> {
         replace::replace_or_keep(path, &[&json[..], b"\n"].concat())?;
     }
     Ok(ExitCode::SUCCESS)
+}
+
+/// Why a picture may be black. The scene is read once more: its blocks do not say what the shapes are called.
+fn why_black(spec: &RenderJobSpec, shot: &Shot, offset: [f64; 3]) -> String {
+    let sight = Sight::new(&shot.frame.camera, shot.frame.size, offset);
+    let found = import(Path::new(&spec.scene.source), &spec::import_options(spec))
+        .and_then(|description| Ok(sight.look(&description)?.walled_in(&description)));
+    match found {
+        Ok(Some(text)) => text,
+        Ok(None) => "no light reached the camera: does it look at what is lit, and from outside?".to_owned(),
+        // it was read before; what is wrong now is no fault of the picture
+        Err(e) => format!("no light reached the camera ({e})"),
+    }
 }
 
 /// The job of file and flags, checked.

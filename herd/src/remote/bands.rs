@@ -96,11 +96,18 @@ impl Adder<'_> {
     ) -> Result<Totals, JobError> {
         let beside: Vec<&str> = self.layout.aovs.channels().collect();
         let mut rows = Rows::new(self, parts, samples, (offset, beside.len()));
+        let mut lit = false;
         let next = |y: u32, row: &mut Row| -> Result<(), JobError> {
             rows.next(y, row)?;
+            lit |= row.light.iter().any(|pixel| *pixel != [0.0; 3]);
             seen(&row.light)
         };
         picture::write(self.layout.size, &beside, definition, next, out)?;
+        if !lit {
+            tracing::warn!(
+                "the picture is black: no light reached the camera; rayherd check SCENE says whether it stands inside of a shape"
+            );
+        }
         Ok(rows.totals)
     }
 

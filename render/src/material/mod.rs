@@ -12,6 +12,8 @@ mod gloss;
 mod phong;
 mod plastic;
 mod principled;
+#[cfg(test)]
+mod random_tests;
 mod rough;
 #[cfg(test)]
 mod tests;

@@ -89,6 +89,14 @@ pub fn header(path: &Path, raw: bool) -> Result<Header, String> {
     Ok(header)
 }
 
+/// Whether an image is a PNG with an alpha channel, or with transparent colours in its palette; false also where it cannot be read.
+pub fn has_alpha(path: &Path) -> bool {
+    match open(path) {
+        Ok((Format::Png, file, _)) => png::has_alpha(file),
+        _ => false,
+    }
+}
+
 /// Reads an image.
 ///
 /// # Errors

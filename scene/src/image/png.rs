@@ -42,6 +42,10 @@ pub(super) fn header(file: Input, raw: bool) -> Result<Header, String> {
     header_of(&open(file)?, raw)
 }
 
+pub(super) fn has_alpha(file: Input) -> bool {
+    open(file).is_ok_and(|reader| matches!(reader.output_color_type().0, ColorType::GrayscaleAlpha | ColorType::Rgba))
+}
+
 pub(super) fn read(file: Input, raw: bool) -> Result<Image, String> {
     let mut reader = open(file)?;
     let header = header_of(&reader, raw)?;

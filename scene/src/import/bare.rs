@@ -7,10 +7,11 @@ use super::framing::{self, Up};
 use super::isosurface::IsoSurfaceSource;
 use super::mesh::extension;
 use super::mtl::Libraries;
+use super::passed_over::passed_over;
 use super::{DEFAULT_ALBEDO, ImportOptions, inside, refuse};
 use crate::ImportError;
 use crate::description::{
-    Affine, Bsdf, Description, Detail, Environment, Geometry, Material, MeshFormat, Place, Shape, Slot, Texture,
+    Affine, Bsdf, Description, Detail, Environment, Geometry, Material, MeshFormat, Note, Place, Shape, Slot, Texture,
     TextureKind, Textured,
 };
 
@@ -60,11 +61,15 @@ pub(super) fn meshes(
         let looks = looks && options.albedo.is_none();
         match format {
             MeshFormat::Obj if looks => {
-                let (names, bytes) = super::obj::libraries(path)?;
-                out.bytes_read += bytes;
+                let head = super::obj::head(path)?;
+                out.bytes_read += head.bytes_read;
+                if let Some(text) = head.passed_over() {
+                    let place = Place { file: path.into(), line: head.line };
+                    out.notes.push(Note { place, text: text.into() });
+                }
                 let folder = inside::folder_of(path)?;
                 let mut libraries = Libraries { options, out: &mut out, unsupported: vec![], folder };
-                let found = libraries.read(path, &names)?;
+                let found = libraries.read(path, &head.libraries)?;
                 (parts, made) = (Some(found.0), found.1);
                 unsupported.append(&mut libraries.unsupported);
             }
@@ -72,6 +77,12 @@ pub(super) fn meshes(
                 let (found, bytes) = super::ply::colors(path)?;
                 out.bytes_read += bytes;
                 attribute = found;
+            }
+            MeshFormat::Stl if looks => {
+                let head = passed_over(path, format);
+                out.bytes_read += head.bytes_read;
+                let place = Place { file: path.into(), line: 0 };
+                out.notes.extend(head.colors.map(|text| Note { place, text: text.into() }));
             }
             _ => {}
         }

@@ -12,12 +12,14 @@ mod mtl;
 mod number;
 mod obj;
 mod options;
+mod passed_over;
 mod placement;
 mod ply;
 mod refraction;
 pub(crate) mod regular;
 mod serialized;
 mod shapes;
+mod sight;
 mod sky;
 mod skylight;
 mod source;
@@ -36,6 +38,7 @@ pub use options::{
     CameraView, DEFAULT_ALBEDO, ImportOptions, Light, OptionError, parse_albedo, parse_define, parse_radiance,
 };
 pub use placement::Placement;
+pub use sight::Sight;
 pub use sky::sky_map;
 pub(crate) use sky::to_map;
 pub(crate) use skylight::PICTURE_TO_SKY;

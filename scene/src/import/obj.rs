@@ -56,20 +56,50 @@ pub(super) struct Face {
 /// A `mtllib` statement: what it says, and the line.
 pub(super) type LibraryNames = Vec<(String, u32)>;
 
-/// The `mtllib` statements before a file's first vertex, face or `usemtl`; and the bytes read to find them.
-pub(super) fn libraries(path: &Path) -> Result<(LibraryNames, u64), ImportError> {
+/// What stands before and in a file's first vertex.
+pub(super) struct Head {
+    /// The `mtllib` statements before the first vertex, face or `usemtl`.
+    pub libraries: LibraryNames,
+    /// Numbers of the first vertex, if that is what comes first.
+    pub numbers: usize,
+    /// Line of it.
+    pub line: u32,
+    /// Bytes read to find them.
+    pub bytes_read: u64,
+}
+
+impl Head {
+    /// What vertices have beside a position, which nothing here uses.
+    pub fn passed_over(&self) -> Option<&'static str> {
+        match self.numbers {
+            0..=3 => None,
+            4 | 5 => Some("weights of the obj's vertices are passed over"),
+            _ => Some("colours of the obj's vertices are passed over: a ply with colours is read with them"),
+        }
+    }
+}
+
+/// The head of a file.
+pub(super) fn head(path: &Path) -> Result<Head, ImportError> {
     let mut reader = ObjReader::new(Source::open_head(path)?, &StreamOptions::default(), None);
-    let mut out = vec![];
+    let mut out = Head { libraries: vec![], numbers: 0, line: 0, bytes_read: 0 };
     while reader.read_line()? {
         let line = reader.line.trim_ascii_start();
         let (keyword, rest) = line.split_at(line.iter().position(u8::is_ascii_whitespace).unwrap_or(line.len()));
         match keyword {
-            b"mtllib" => out.push((name_of(rest), reader.source.place().1)),
-            b"v" | b"vn" | b"vt" | b"f" | b"usemtl" => break,
+            b"mtllib" => out.libraries.push((name_of(rest), reader.source.place().1)),
+            b"v" => {
+                let words = rest.split(|b| b.is_ascii_whitespace()).filter(|w| !w.is_empty());
+                out.numbers = words.take_while(|w| w[0] != b'#').count();
+                out.line = reader.source.place().1;
+                break;
+            }
+            b"vn" | b"vt" | b"f" | b"usemtl" => break,
             _ => {}
         }
     }
-    Ok((out, reader.source.bytes_read()))
+    out.bytes_read = reader.source.bytes_read();
+    Ok(out)
 }
 
 /// A name as messages and maps have it.

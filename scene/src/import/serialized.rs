@@ -88,6 +88,15 @@ impl SerializedReader {
         Ok(SerializedReader { source, budget, positions, normals, uv, face_normals, index, count, done: 0 })
     }
 
+    /// Whether mesh number `index` of a file has colours, and the bytes read to know.
+    pub fn has_colors(path: &Path, index: u32) -> Result<(bool, u64), ImportError> {
+        let mut file = Source::open(path)?;
+        let (at, _) = find(&mut file, index)?;
+        let mut source = file.into_zlib(at + 4)?;
+        let flags = u32_of(&mut source)?;
+        Ok((flags & HAS_COLORS != 0, source.bytes_read()))
+    }
+
     /// The mesh says that it has no smooth normals and wants none.
     pub fn face_normals(&self) -> bool {
         self.face_normals

@@ -66,6 +66,19 @@ impl StlReader {
         Ok(StlReader { source, budget: budget(options), format: Format::Binary { count }, done: 0 })
     }
 
+    /// Whether a file has colours, as far as its head and its first triangle tell, and the bytes read for it. Two programs have put them into
+    /// the 16 bits that the format leaves free, one of them with `COLOR=` in the head.
+    pub fn has_colors(path: &Path) -> Result<(bool, u64), ImportError> {
+        let reader = StlReader::open(path, &StreamOptions::default())?;
+        let Format::Binary { count } = reader.format else { return Ok((false, reader.source.bytes_read())) };
+        let mut source = Source::open_head(path)?;
+        let head = source.peek(HEAD as usize + TRIANGLE)?;
+        let said = head.get(..80).is_some_and(|text| text.windows(6).any(|w| w == b"COLOR="));
+        let word = head.get(HEAD as usize + TRIANGLE - 2..).unwrap_or_default();
+        let colored = count > 0 && (said || word.iter().any(|b| *b != 0));
+        Ok((colored, reader.source.bytes_read() + source.bytes_read()))
+    }
+
     fn next_binary(&mut self) -> Result<[[f64; 3]; 3], ImportError> {
         let bytes = self.source.exact(TRIANGLE)?;
         let float = |i: usize| {

@@ -1,5 +1,8 @@
 //! What a description holds, without preparing it: counts, bounds, files that cannot be read.
 
+use rayherd_render::camera::{Camera, View};
+
+use super::Sight;
 use super::stream::{DescriptionSource, StreamOptions};
 use crate::ImportError;
 use crate::description::{Description, TextureKind};
@@ -20,6 +23,8 @@ pub struct Survey {
     pub bounds: [[f64; 3]; 2],
     /// Bytes of the source that were read for it.
     pub bytes_read: u64,
+    /// If the camera sees nothing but backs that take all light: which, and what to do.
+    pub walled_in: Option<String>,
 }
 
 /// One shape.
@@ -47,7 +52,14 @@ impl Survey {
     /// Reads every shape and every texture once. What cannot be read is noted, and the next one is read.
     pub fn of(description: &Description) -> Survey {
         let source = DescriptionSource::new(description, StreamOptions::default());
-        let mut out = Survey { shapes: Vec::new(), textures: Vec::new(), bounds: super::bounds::EMPTY, bytes_read: 0 };
+        let mut out = Survey {
+            shapes: Vec::new(),
+            textures: Vec::new(),
+            bounds: super::bounds::EMPTY,
+            bytes_read: 0,
+            walled_in: None,
+        };
+        let mut sight = sight(description);
         for texture in &description.textures {
             let TextureKind::Image { path, raw, .. } = &texture.kind else {
                 out.textures.push(Ok(0));
@@ -59,11 +71,12 @@ impl Survey {
         }
         out.shapes.resize_with(description.shapes.len(), ShapeSurvey::default);
         for number in 0..description.shapes.len() {
-            match read(&source, number, &mut out.shapes, &mut out.bounds) {
+            match read(&source, number, &mut out.shapes, &mut out.bounds, sight.as_mut()) {
                 Ok(bytes) => out.bytes_read += bytes,
                 Err(error) => out.shapes[number].error = Some(error),
             }
         }
+        out.walled_in = sight.and_then(|sight| sight.walled_in(description));
         out
     }
 
@@ -88,11 +101,19 @@ impl Survey {
     }
 }
 
+/// What the scene's camera sees; none of a camera that cannot be, whose own error comes when it is used.
+fn sight(description: &Description) -> Option<Sight> {
+    let (camera, size) = (description.camera.as_ref()?, description.size?);
+    let view = View { to_world: camera.to_world.0, projection: camera.projection, crop: camera.crop };
+    Some(Sight::new(&Camera::of(&view, size, [0.0; 3]).ok()?, size, [0.0; 3]))
+}
+
 fn read(
     source: &DescriptionSource,
     number: usize,
     shapes: &mut [ShapeSurvey],
     bounds: &mut [[f64; 3]; 2],
+    mut sight: Option<&mut Sight>,
 ) -> Result<u64, ImportError> {
     let mut stream = source.open_one(number)?;
     let mut records = vec![];
@@ -107,6 +128,7 @@ fn read(
             let (Record::Triangle(TriangleRecord { shape, .. }) | Record::Sphere(SphereRecord { shape, .. })) = record;
             let shape = &mut shapes[*shape as usize];
             shape.not_finite += u64::from(!finite);
+            sight.iter_mut().for_each(|sight| sight.see(record));
             match record {
                 Record::Triangle(t) => {
                     shape.triangles += 1;

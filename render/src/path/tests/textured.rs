@@ -6,8 +6,9 @@ use super::mean_of;
 use crate::film::FilmPart;
 use crate::frame::Frame;
 use crate::light::Lights;
-use crate::material::{Amount, Blend, Bsdf, Detail, Relief, ReliefKind};
+use crate::material::{Amount, Blend, Bsdf, Detail, Distribution, Principled, Relief, ReliefKind};
 use crate::path::{Context, reference};
+use crate::testing::Rng;
 use crate::texture::{Checkerboard, Texture, UvMap};
 
 /// Gives shapes of a scene everything that detail may be.
@@ -181,4 +182,132 @@ fn two_materials() {
     let front = mean_of(&scene, &frame_back([0.0, 0.0, 4.0], 20.0, [8, 8], 6), 256);
     let behind = mean_of(&scene, &frame([0.0, 0.0, -4.0], 20.0, [8, 8], 6), 256);
     assert!((front - 0.8).abs() < 0.01 && (behind - 0.3).abs() < 0.01, "{front} {behind}");
+}
+
+/// Random reliefs: bumps of slopes up to about 1, and normals up to 35 degrees off the surface's.
+fn reliefs(scene: &mut Scene, rng: &mut Rng) -> [Relief; 2] {
+    let heights = (0..8 * 8 * 3).map(|_| rng.u32() as u8).collect();
+    let heights = scene.image([8, 8], heights);
+    let normals = (0..8 * 8).flat_map(|_| {
+        let [x, y] = [0; 2].map(|_| rng.range(-0.5, 0.5));
+        [x, y, 1.0].map(|v| ((v / (x * x + y * y + 1.0).sqrt() * 0.5 + 0.5) * 255.0) as u8)
+    });
+    let normals = normals.collect();
+    let normals = scene.image([8, 8], normals);
+    [(ReliefKind::Bump(0.1), heights), (ReliefKind::Normals, normals)].map(|(kind, texture)| Relief {
+        kind,
+        texture,
+        mirrored: true,
+    })
+}
+
+/// A closed box with wild reliefs, lit from outside only: no light comes in, though the normals would let it.
+#[test]
+fn reliefs_leak_nothing() {
+    let mut rng = Rng(31);
+    for strong in [false, true] {
+        for kind in 0..2 {
+            for inside in [true, false] {
+                let mut scene = Scene { environment: Some([1.0; 3]), ..Scene::default() };
+                let mut relief = reliefs(&mut scene, &mut rng)[kind];
+                if strong {
+                    let any = (0..4 * 4 * 3).map(|_| rng.u32() as u8).collect();
+                    relief.texture = scene.image([4, 4], any);
+                    if kind == 0 {
+                        relief.kind = ReliefKind::Bump(50.0);
+                    }
+                }
+                let detail = || Detail { relief: Some(relief), ..Detail::default() };
+                let metal = Bsdf::RoughConductor {
+                    distribution: Distribution::Ggx,
+                    alpha: [0.3; 2],
+                    eta: [0.0; 3],
+                    k: [1.0; 3],
+                    specular: [1.0; 3],
+                };
+                let walls = [Bsdf::Diffuse { reflectance: [0.9; 3] }, metal].map(|bsdf| scene.detailed(bsdf, detail()));
+                let half = Some(Blend { weight: Amount::Constant(0.5), parts: walls });
+                let blend = scene
+                    .detailed(Bsdf::Diffuse { reflectance: [0.0; 3] }, Detail { blend: half, ..Detail::default() });
+                let shape = scene.shape(blend, None);
+                box_inside(&mut scene, shape);
+                if inside {
+                    scene.sphere(shape, [0.3, 0.3, 0.4], 0.3, false);
+                }
+                let light = scene.shape(blend, Some([10.0; 3]));
+                scene.sphere(light, [0.0, 5.0, 0.0], 2.0, false);
+                let found = mean_of(&scene, &frame([0.1, 0.2, -0.3], 80.0, [16, 16], 6), 64);
+                assert_eq!(found, 0.0, "strong {strong}, kind {kind}, something inside {inside}");
+            }
+        }
+    }
+}
+
+/// White balls and walls with reliefs before a white sky: no pixel is brighter than the sky, and none is black, grazing ones included: the normal is on the
+/// ray's side everywhere. What is missing is what a bent lobe sends into the surface.
+#[test]
+fn reliefs_before_a_white_sky() {
+    let mut rng = Rng(32);
+    let metal = |distribution, alpha| Bsdf::RoughConductor {
+        distribution,
+        alpha: [alpha; 2],
+        eta: [0.0; 3],
+        k: [1.0; 3],
+        specular: [1.0; 3],
+    };
+    let plain = Principled {
+        base_color: [1.0; 3],
+        eta: 1.5,
+        roughness: 0.4,
+        anisotropic: 0.0,
+        metallic: 1.0,
+        spec_trans: 0.0,
+        spec_tint: 0.0,
+        sheen: 0.0,
+        sheen_tint: 0.0,
+        clearcoat: 0.0,
+        clearcoat_gloss: 0.0,
+        flatness: 0.0,
+    };
+    for kind in 0..2 {
+        for (name, bsdf) in [
+            ("diffuse", Bsdf::Diffuse { reflectance: [1.0; 3] }),
+            ("beckmann", metal(Distribution::Beckmann, 0.2)),
+            ("ggx", metal(Distribution::Ggx, 0.5)),
+            ("principled", Bsdf::Principled(plain)),
+            ("plastic", Bsdf::Plastic { eta: 1.5, diffuse: [1.0; 3], specular: [1.0; 3], nonlinear: true }),
+            ("blend", Bsdf::Diffuse { reflectance: [0.0; 3] }),
+        ] {
+            for ball in [true, false] {
+                let mut scene = Scene { environment: Some([1.0; 3]), ..Scene::default() };
+                let relief = Some(reliefs(&mut scene, &mut rng)[kind]);
+                let detail = || Detail { relief, ..Detail::default() };
+                let material = if name == "blend" {
+                    let of = [Bsdf::Diffuse { reflectance: [1.0; 3] }, metal(Distribution::Ggx, 0.3)];
+                    let parts = of.map(|bsdf| scene.detailed(bsdf, detail()));
+                    let blend = Some(Blend { weight: Amount::Constant(0.5), parts });
+                    scene.detailed(bsdf.clone(), Detail { blend, ..Detail::default() })
+                } else {
+                    scene.detailed(bsdf.clone(), detail())
+                };
+                let shape = scene.shape(material, None);
+                // a ball that fills the picture to its silhouette; a wall seen from 4 degrees above it
+                let frame = if ball {
+                    scene.sphere(shape, [0.0, 0.0, 0.0], 1.0, false);
+                    frame([0.0, 0.0, -6.0], 19.0, [24, 24], 2)
+                } else {
+                    scene.quad(shape, [-9.0, -0.4, -9.0], [0.0, 0.0, 18.0], [18.0, 0.0, 0.0]);
+                    frame([0.0, 0.0, -6.0], 12.0, [24, 24], 2)
+                };
+                let pixels: Vec<f32> = picture(&scene, &frame, 256).iter().map(|p| p[0]).collect();
+                let mean = pixels.iter().sum::<f32>() / pixels.len() as f32;
+                let (low, high) = pixels.iter().fold((f32::MAX, 0.0f32), |(l, h), &p| (l.min(p), h.max(p)));
+                println!("{name}, kind {kind}, ball {ball}: {mean:.3} from {low:.3} to {high:.3}");
+                assert!(
+                    mean < 1.005 && mean > 0.75 && high < 1.2 && low > 0.3,
+                    "{name}, kind {kind}, ball {ball}: {mean} {low} {high}"
+                );
+            }
+        }
+    }
 }

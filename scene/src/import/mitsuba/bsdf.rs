@@ -1,7 +1,7 @@
 //! Materials.
 
-use super::Converter;
 use super::xml::{ObjectId, Value, malformed};
+use super::{Converter, luminance};
 use crate::ImportError;
 use crate::description::{
     Amount, Bsdf, Detail, Distribution, Material, Place, Relief, ReliefKind, Slot, TextureKind, Textured,
@@ -127,6 +127,12 @@ impl Converter<'_> {
             [(p, front), (q, back)] => (self.bsdf(front, &p.place)?, Some((back, q))),
             _ => return malformed(place, "twosided needs one or two materials inside"),
         };
+        if self.lets_through(&front) {
+            self.note(
+                place,
+                "twosided around a material that light passes: it has two sides of its own, twosided changes nothing",
+            );
+        }
         self.spread(&mut front, &mirror);
         if let Some((back, q)) = back {
             let mut behind = self.bsdf(back, &q.place)?;
@@ -150,7 +156,7 @@ impl Converter<'_> {
                 Some(number) => number.map_or(Amount::Constant(1.0), Amount::Texture),
                 None => {
                     let [r, g, b] = self.color(id, "opacity", 1.0)?.unwrap_or([0.5; 3]);
-                    let opacity = if r == g && g == b { r } else { 0.2126 * r + 0.7152 * g + 0.0722 * b };
+                    let opacity = luminance([r, g, b]);
                     if !(0.0..=1.0).contains(&opacity) {
                         return malformed(&p.place, format!("opacity {opacity} should lie in [0, 1]"));
                     }
@@ -246,6 +252,15 @@ impl Converter<'_> {
         })
     }
 
+    /// Whether light passes a material, or something that it is blended of.
+    fn lets_through(&self, material: &Material) -> bool {
+        let blend = material.detail.as_ref().and_then(|d| d.blend.as_ref());
+        match blend {
+            Some(blend) => blend.parts.iter().any(|n| self.lets_through(&self.out.materials[*n as usize])),
+            None => material.bsdf.transmits(),
+        }
+    }
+
     /// The one material inside an adapter.
     fn only_one_inside(&mut self, id: ObjectId, plugin: &str) -> Result<Material, ImportError> {
         match self.nested(id, "bsdf")?[..] {
@@ -287,17 +302,28 @@ impl Converter<'_> {
         let eta = self.color(id, "eta", 0.2)?;
         let k = self.color(id, "k", 3.0)?;
         let material = self.string(id, "material")?;
-        let (eta, k) = match (eta, k, material) {
-            (None, None, Some((name, at))) if name != "none" => match metals::find(name) {
+        let by_value = eta.is_some() || k.is_some();
+        let named = match material {
+            Some((name, at)) if by_value && name != "none" && !self.document.old => {
+                return malformed(at, "material beside eta or k: give one or the other");
+            }
+            // 0.5 and 0.6 have the values win over the name
+            Some((name, at)) if eta.is_some() && k.is_some() && name != "none" => {
+                self.note(at, format!("material \"{name}\" is passed over: eta and k are given"));
+                None
+            }
+            Some((name, at)) if name != "none" => Some(match metals::find(name) {
                 Some(metal) => (metal.eta.map(f64::from), metal.k.map(f64::from)),
                 None => {
                     self.unsupported(at, format!("material \"{name}\""), "copper");
                     metals::find("Cu").map_or(([0.0; 3], [1.0; 3]), |m| (m.eta.map(f64::from), m.k.map(f64::from)))
                 }
-            },
-            // Mitsuba's default: a perfect mirror
-            (eta, k, _) => (eta.unwrap_or([0.0; 3]), k.unwrap_or([1.0; 3])),
+            }),
+            _ => None,
         };
+        // Mitsuba's default: a perfect mirror
+        let (eta_of, k_of) = named.unwrap_or(([0.0; 3], [1.0; 3]));
+        let (eta, k) = (eta.unwrap_or(eta_of), k.unwrap_or(k_of));
         if !eta.iter().chain(&k).all(|v| (0.0..=LARGEST_INDEX).contains(v)) {
             return malformed(place, format!("eta and k should lie between 0 and {LARGEST_INDEX}"));
         }
@@ -338,7 +364,7 @@ impl Converter<'_> {
                 textured.extend(number.map(|texture| Textured::new(slot, texture)));
                 return Ok(Some(0.1));
             }
-            Ok(self.color(id, name, 0.1)?.map(|v| v[0]))
+            Ok(self.color(id, name, 0.1)?.map(luminance))
         };
         let given = (get("alpha", Slot::Alpha)?, get("alpha_u", Slot::AlphaU)?, get("alpha_v", Slot::AlphaV)?);
         let alpha = match given {

@@ -30,7 +30,11 @@ impl Converter<'_> {
                 Bsdf::RoughDielectric { distribution, alpha, eta, reflect, transmit }
             }
             "roughdielectric" => {
-                self.ignore(id, &["sample_visible", "distribution", "alpha", "alpha_u", "alpha_v"]);
+                // read for what is wrong with them
+                (self.distribution(id)?, self.roughness(id, &mut Textures::new())?);
+                self.ignore(id, &["sample_visible"]);
+                let place = &self.document.objects[id].place;
+                self.note(place, "roughdielectric between equal indices: light passes unbent, whatever its roughness");
                 Bsdf::Dielectric { eta, reflect, transmit }
             }
             _ => Bsdf::Dielectric { eta, reflect, transmit },

@@ -1,8 +1,8 @@
 //! Materials of several parts: `principled`, `phong`, `blendbsdf`.
 
-use super::Converter;
 use super::bsdf::{Textures, bsdf_name, detail_of};
 use super::xml::{ObjectId, malformed};
+use super::{Converter, luminance};
 use crate::ImportError;
 use crate::description::{Amount, Blend, Bsdf, Material, Principled, Slot, Textured};
 
@@ -67,7 +67,11 @@ impl Converter<'_> {
         let place = &self.document.objects[id].place;
         let diffuse = self.paint(id, "diffuse_reflectance", Slot::Diffuse, textured)?.unwrap_or([0.5; 3]);
         let specular = self.paint(id, "specular_reflectance", Slot::Specular, textured)?.unwrap_or([0.2; 3]);
-        let exponent = self.color(id, "exponent", 30.0)?.map_or(30.0, |v| v[0]);
+        let exponent = self.color(id, "exponent", 30.0)?.unwrap_or([30.0; 3]);
+        if exponent != [exponent[0]; 3] {
+            return malformed(place, format!("exponent {exponent:?} should be one number"));
+        }
+        let exponent = exponent[0];
         if !(0.0..=LARGEST_EXPONENT).contains(&exponent) {
             return malformed(place, format!("exponent {exponent} should lie between 0 and {LARGEST_EXPONENT}"));
         }
@@ -113,8 +117,7 @@ impl Converter<'_> {
             textured.extend(number.map(|texture| Textured::new(slot, texture)));
             return Ok(default);
         }
-        let [r, g, b] = self.color(id, name, default.into())?.unwrap_or([default.into(); 3]);
-        let value = if r == g && g == b { r } else { 0.2126 * r + 0.7152 * g + 0.0722 * b };
+        let value = luminance(self.color(id, name, default.into())?.unwrap_or([default.into(); 3]));
         if !(0.0..=1.0).contains(&value) {
             return malformed(&p.place, format!("{name} {value} should lie in [0, 1]"));
         }

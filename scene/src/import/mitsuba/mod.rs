@@ -34,7 +34,7 @@ use std::path::Path;
 use self::xml::{Document, ObjectId, Property, Value, malformed};
 use super::ImportOptions;
 use crate::ImportError;
-use crate::description::{Affine, Description, Place};
+use crate::description::{Affine, Description, Note, Place};
 
 /// Reads a scene file.
 pub(super) fn import(path: &Path, options: &ImportOptions) -> Result<Description, ImportError> {
@@ -58,7 +58,8 @@ pub(super) fn import(path: &Path, options: &ImportOptions) -> Result<Description
         return Err(ImportError::Unsupported(converter.unsupported));
     }
     let mut out = converter.out;
-    out.bytes_read = document.bytes_read;
+    // heads of meshes were read on the way
+    out.bytes_read += document.bytes_read;
     Ok(out)
 }
 
@@ -90,6 +91,22 @@ impl<'a> Converter<'a> {
     fn unsupported(&mut self, place: &Place, what: impl Into<String>, stand_in: &str) {
         let found = (place.clone(), what.into());
         self.options.note_unsupported(found, stand_in, &mut self.out.substitutions, &mut self.unsupported);
+    }
+
+    /// Notes what is read and changes nothing.
+    fn note(&mut self, place: &Place, text: impl Into<String>) {
+        self.out.notes.push(Note { place: place.clone(), text: text.into() });
+    }
+
+    /// Notes those of an object's properties that say something of another program's ways, all in one.
+    fn pass_over(&mut self, object: ObjectId, names: &[&str], why: &str) {
+        let o = &self.document.objects[object];
+        let given = o.properties.iter().filter(|p| names.contains(&p.name.as_str()) && !p.used.replace(true));
+        let list: Vec<&str> = given.map(|p| p.name.as_str()).collect();
+        if !list.is_empty() {
+            let text = format!("{} of {} \"{}\": {why}", list.join(", "), o.class, o.plugin);
+            self.note(&o.place, text);
+        }
     }
 
     /// The property of a name, marked as used.
@@ -182,7 +199,11 @@ impl<'a> Converter<'a> {
                 let texture = &self.document.objects[id];
                 match (texture.class.as_str(), texture.plugin.as_str()) {
                     ("spectrum" | "texture", "uniform") => {
-                        return Ok(self.float(id, "value")?.map(|v| [v; 3]));
+                        let Some(v) = self.float(id, "value")? else {
+                            return malformed(&texture.place, "a uniform texture lacks its value");
+                        };
+                        self.report_unused(id);
+                        return Ok(Some([v; 3]));
                     }
                     (class, plugin) => format!("{class} \"{plugin}\" for \"{name}\""),
                 }
@@ -228,9 +249,14 @@ impl<'a> Converter<'a> {
         Ok(())
     }
 
-    /// Ends an object: what nobody asked for is unsupported.
+    /// Ends an object.
     fn leave(&mut self, object: ObjectId) {
         self.open.remove(&object);
+        self.report_unused(object);
+    }
+
+    /// What nobody asked for of an object is unsupported.
+    fn report_unused(&mut self, object: ObjectId) {
         let o = &self.document.objects[object];
         for p in o.properties.iter().filter(|p| !p.used.get()) {
             p.used.set(true);
@@ -247,6 +273,11 @@ impl<'a> Converter<'a> {
     }
 }
 
+/// The luminance of a colour, which is what a number of it is, as in Mitsuba.
+fn luminance([r, g, b]: [f64; 3]) -> f64 {
+    if r == g && g == b { r } else { 0.2126 * r + 0.7152 * g + 0.0722 * b }
+}
+
 /// The first characters of a long text.
 fn shorten(text: &str) -> String {
     if text.chars().count() <= 40 { text.into() } else { text.chars().take(40).chain("...".chars()).collect() }
@@ -258,6 +289,8 @@ mod composed_tests;
 mod daylight_tests;
 #[cfg(test)]
 mod emitter_tests;
+#[cfg(test)]
+mod passed_over_tests;
 #[cfg(test)]
 mod sensor_tests;
 #[cfg(test)]

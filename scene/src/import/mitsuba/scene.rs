@@ -5,7 +5,6 @@ use rayherd_render::aov::{Aov, Aovs};
 
 use super::xml::malformed;
 use crate::ImportError;
-use crate::description::Note;
 
 /// Most rays of a path; what a frame takes.
 const LARGEST_DEPTH: u32 = 65535;
@@ -53,7 +52,10 @@ impl Converter<'_> {
             let name = object.id.as_deref().unwrap_or(&object.plugin);
             tracing::warn!("{}: sensor \"{name}\" is left out: the first of a scene's sensors is used", object.place);
         }
-        for (_, id) in self.nested(root, "integrator")? {
+        for (n, (_, id)) in self.nested(root, "integrator")?.into_iter().enumerate() {
+            if n > 0 {
+                return malformed(&self.document.objects[id].place, "a second integrator: a scene has one");
+            }
             self.integrator(id)?;
         }
         // materials first, so that their numbers follow the file whoever refers to them
@@ -83,9 +85,8 @@ impl Converter<'_> {
         self.out.max_depth = match self.integer(id, "max_depth")? {
             None => None,
             Some(-1) => {
-                let text =
-                    "max_depth -1 (unbounded): paths have as many rays as --max-depth says, 65 by default".into();
-                self.out.notes.push(Note { place: place.clone(), text });
+                let text = "max_depth -1 (unbounded): paths have as many rays as --max-depth says, 65 by default";
+                self.note(place, text);
                 None
             }
             Some(n) => match u32::try_from(n) {
@@ -104,14 +105,19 @@ impl Converter<'_> {
             "path" => {}
             plugin if FULL_TRANSPORT.contains(&plugin) => {
                 tracing::info!(integrator = plugin, "rendered by path tracing, which estimates the same image");
-                for p in &object.properties {
-                    // settings of another algorithm for the same image
-                    if p.name != "hide_emitters" {
-                        p.used.set(true);
-                    }
-                }
+                let names = object.properties.iter().map(|p| p.name.as_str()).filter(|name| *name != "hide_emitters");
+                let names: Vec<&str> = names.collect();
+                self.pass_over(id, &names, "path tracing estimates the same image without them");
             }
-            "direct" => self.out.max_depth = Some(2),
+            "direct" => {
+                if self.out.max_depth.is_some() || self.out.rr_depth.is_some() {
+                    self.note(
+                        place,
+                        "integrator \"direct\" has paths of two rays, whatever max_depth and rr_depth say",
+                    );
+                }
+                (self.out.max_depth, self.out.rr_depth) = (Some(2), None);
+            }
             plugin => {
                 self.unsupported(place, format!("integrator \"{plugin}\""), "path tracing");
                 if self.options.substitute {
@@ -119,7 +125,11 @@ impl Converter<'_> {
                 }
             }
         }
-        self.ignore(id, &["strict_normals", "samples_per_pass", "block_size", "timeout"]);
+        if self.boolean(id, "strict_normals")? == Some(true) {
+            self.note(place, "strict_normals changes nothing: light never leaks through bent normals here");
+        }
+        self.ignore(id, &["samples_per_pass", "block_size"]);
+        self.pass_over(id, &["timeout"], "a render ends with its last sample");
         self.out.hide_emitters = self.boolean(id, "hide_emitters")?.unwrap_or(false);
         self.leave(id);
         Ok(())
@@ -143,7 +153,7 @@ impl Converter<'_> {
         let aovs: Aovs = aovs.into_iter().collect();
         self.out.aovs = Some(aovs);
         let text = format!("AOVs are layers of the EXR, and have names of their own: {aovs}");
-        self.out.notes.push(Note { place, text });
+        self.note(&place, text);
         let mut inner = self.nested(id, "integrator")?.into_iter();
         if let Some((property, nested)) = inner.next() {
             match self.document.objects[nested].plugin.as_str() {

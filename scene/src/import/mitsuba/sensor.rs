@@ -1,15 +1,18 @@
 //! Sensor, film, sampler and pixel filter.
 
 use super::Converter;
-use super::xml::{ObjectId, malformed};
+use super::xml::{ObjectId, Value, malformed};
 use crate::ImportError;
 use crate::description::{Camera, Filter, Place, Projection};
 
 /// A film's size, and the part of it that is the picture: x, y, width, height.
 type Crop = ([u32; 2], [u32; 4]);
 
-/// Largest width or height of a film.
-const MAX_SIDE: i64 = 1 << 16;
+/// Films that hold a picture in colours: those of 0.5, 0.6 and 3.
+const FILMS: &[&str] = &["hdrfilm", "ldrfilm", "mfilm", "tiledhdrfilm", "exrfilm", "pngfilm"];
+
+/// Largest width or height of a film: what a frame takes.
+const MAX_SIDE: i64 = 65535;
 
 impl Converter<'_> {
     pub(super) fn sensor(&mut self, id: ObjectId) -> Result<(), ImportError> {
@@ -19,10 +22,16 @@ impl Converter<'_> {
         self.out.size = Some([768, 576]);
         self.out.filter = Some(Filter::Gaussian { stddev: 0.5 });
         let mut crop = None;
-        for (_, film) in self.nested(id, "film")? {
+        let (films, samplers) = (self.nested(id, "film")?, self.nested(id, "sampler")?);
+        for (what, found) in [("film", &films), ("sampler", &samplers)] {
+            if let Some((p, _)) = found.get(1) {
+                return malformed(&p.place, format!("a second {what} in one sensor: leave one of them"));
+            }
+        }
+        for (_, film) in films {
             crop = self.film(film)?;
         }
-        for (_, sampler) in self.nested(id, "sampler")? {
+        for (_, sampler) in samplers {
             if let Some(n) = self.integer(sampler, "sample_count")? {
                 match u32::try_from(n) {
                     Ok(n) if n > 0 => self.out.spp = Some(n),
@@ -54,7 +63,9 @@ impl Converter<'_> {
             return malformed(place, "the sensor's to_world is singular");
         }
         self.out.camera = Some(Camera { to_world, projection, crop });
-        self.ignore(id, &["near_clip", "far_clip", "focus_distance", "shutter_open", "shutter_close"]);
+        self.ignore(id, &["focus_distance"]);
+        self.pass_over(id, &["near_clip", "far_clip"], "nothing is clipped");
+        self.pass_over(id, &["shutter_open", "shutter_close"], "nothing moves while the shutter is open");
         for name in ["principal_point_offset_x", "principal_point_offset_y"] {
             if self.float(id, name)?.is_some_and(|v| v != 0.0) {
                 self.unsupported(place, name, "0");
@@ -121,6 +132,15 @@ impl Converter<'_> {
     fn film(&mut self, id: ObjectId) -> Result<Option<Crop>, ImportError> {
         let object = &self.document.objects[id];
         let place = &object.place;
+        if !FILMS.contains(&object.plugin.as_str()) {
+            self.unsupported(place, format!("film \"{}\"", object.plugin), "hdrfilm");
+            if self.options.substitute {
+                // of what it has beside a size nothing is known
+                let known = ["width", "height", "crop_offset_x", "crop_offset_y", "crop_width", "crop_height"];
+                let others = object.properties.iter().filter(|p| !known.contains(&p.name.as_str()));
+                others.filter(|p| !matches!(p.value, Value::Object(_))).for_each(|p| p.used.set(true));
+            }
+        }
         let mut size = [768, 576];
         for (slot, name) in size.iter_mut().zip(["width", "height"]) {
             if let Some(n) = self.integer(id, name)? {
@@ -148,7 +168,11 @@ impl Converter<'_> {
         let part = [x, y, width, height].map(|n| n as u32);
         self.out.size = Some([part[2], part[3]]);
         let crop = (part != [0, 0, size[0], size[1]]).then_some((size, part));
-        for (_, filter) in self.nested(id, "rfilter")? {
+        let filters = self.nested(id, "rfilter")?;
+        if let Some((p, _)) = filters.get(1) {
+            return malformed(&p.place, "a second rfilter in one film: leave one of them");
+        }
+        for (_, filter) in filters {
             self.out.filter = Some(self.filter(filter)?);
         }
         // how Mitsuba stores its picture is nothing to us
@@ -188,7 +212,10 @@ impl Converter<'_> {
         };
         let filter = match object.plugin.as_str() {
             "box" => {
-                self.ignore(id, &["radius"]);
+                // half of what rounding leaves of half a pixel: Mitsuba's default has a margin, and files write it
+                if let Some(radius) = self.float(id, "radius")?.filter(|r| (r - 0.5).abs() > 1e-3) {
+                    self.unsupported(&object.place, format!("rfilter \"box\" of radius {radius}"), "radius 0.5");
+                }
                 Filter::Box
             }
             "tent" => Filter::Tent { radius: positive(self.float(id, "radius")?.unwrap_or(1.0), "radius")? },

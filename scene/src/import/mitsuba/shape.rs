@@ -4,8 +4,9 @@ use super::Converter;
 use super::xml::{ObjectId, malformed};
 use crate::ImportError;
 use crate::description::{Affine, Geometry, MeshFormat, Place, Shape};
+use crate::import::passed_over::passed_over;
 use crate::import::shapes;
-use crate::import::vector::dot;
+use crate::import::vector::{cross, dot};
 
 /// Most shapes of a scene, those of instances counted one by one.
 const MAX_SHAPES: usize = 1 << 20;
@@ -22,7 +23,9 @@ impl Converter<'_> {
         match object.plugin.as_str() {
             "instance" => return self.instance(id, from, outer),
             "shapegroup" => {
-                object.properties.iter().for_each(|p| p.used.set(true));
+                // its shapes are read where an instance puts them
+                self.nested(id, "shape")?;
+                self.report_unused(id);
                 return Ok(());
             }
             _ => {}
@@ -38,6 +41,11 @@ impl Converter<'_> {
         }
         if !to_world.determinant().is_finite() {
             return malformed(place, "to_world is too large for floating point");
+        }
+        if to_world.determinant() == 0.0 && !keeps_area(&object.plugin, &to_world) {
+            let text =
+                format!("to_world flattens this shape \"{}\": what of it has no area is left out", object.plugin);
+            self.note(place, text);
         }
         let turned = is_turned(&to_world);
         let mut flip = self.boolean(id, "flip_normals")?.unwrap_or(false);
@@ -88,6 +96,16 @@ impl Converter<'_> {
             Some((p, bsdf)) => self.material(*bsdf, &p.place)?,
             None => self.default_material(emission.is_some()),
         };
+        if let Some(Geometry::MeshFile { path, format, .. }) = &geometry {
+            let head = passed_over(path, *format);
+            self.out.bytes_read += head.bytes_read;
+            if head.libraries && bsdfs.is_empty() {
+                self.note(place, "this obj names materials of its own (mtllib), which are not read in an XML scene: it is grey; put a bsdf into the shape");
+            }
+            if let Some(text) = head.colors.filter(|_| bsdfs.is_empty()) {
+                self.note(place, text);
+            }
+        }
         self.ignore(id, &["silhouette_sampling_weight"]);
         self.leave(id);
         let textured = || emission_texture.is_some() || self.is_textured(material);
@@ -194,6 +212,12 @@ impl Converter<'_> {
         *to_world = Affine::IDENTITY;
         Ok(Geometry::Sphere { center, radius })
     }
+}
+
+/// Whether a singular map leaves a flat shape of x and y its area.
+fn keeps_area(plugin: &str, map: &Affine) -> bool {
+    let column = |c: usize| [0, 1, 2].map(|r| map.0[r][c]);
+    matches!(plugin, "rectangle" | "disk") && cross(column(0), column(1)) != [0.0; 3]
 }
 
 /// Whether a map turns what it moves: off its diagonal, or on it below 0, by more than files round (1e-6 of the longest).

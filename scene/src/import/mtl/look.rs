@@ -118,7 +118,16 @@ impl Libraries<'_> {
             "map_kd" => said.map_diffuse = self.texture(s, false)?.map(|t| t.0),
             "map_ks" => said.map_specular = self.texture(s, false)?.map(|t| t.0),
             "map_ke" => said.map_emission = self.texture(s, false)?.map(|t| t.0),
-            "map_d" => said.map_opacity = self.texture(s, true)?.map(|t| t.0),
+            "map_d" => {
+                said.map_opacity = self.texture(s, true)?.map(|t| t.0);
+                if let Some(n) = said.map_opacity
+                    && let TextureKind::Image { path, .. } = &self.out.textures[n as usize].kind
+                    && image::has_alpha(path)
+                {
+                    let text = "map_d of a picture with an alpha channel: its luminance is the opacity, not its alpha";
+                    self.note(&s.place, text.into());
+                }
+            }
             "map_pr" => said.map_roughness = self.texture(s, true)?.map(|t| t.0),
             "map_pm" => said.map_metallic = self.texture(s, true)?.map(|t| t.0),
             "map_bump" | "bump" => {
@@ -168,6 +177,8 @@ impl Libraries<'_> {
         let illum = said.illum.unwrap_or(2);
         let is_glass = matches!(illum, 4 | 6 | 7);
         let is_black = |rgb: [f32; 3]| rgb == [0.0; 3];
+        let extends = extended.iter().any(Option::is_some) || said.map_roughness.or(said.map_metallic).is_some();
+        self.note_unused(entry, said, is_glass, extends);
         let bsdf = if is_glass {
             let index = said.index.unwrap_or(GLASS);
             if said.index.is_none() {
@@ -183,7 +194,7 @@ impl Libraries<'_> {
             } else {
                 Bsdf::Dielectric { eta, reflect, transmit }
             }
-        } else if extended.iter().any(Option::is_some) || said.map_roughness.or(said.map_metallic).is_some() {
+        } else if extends {
             paint(Slot::Diffuse, said.map_diffuse, diffuse);
             // a map replaces the number: exporters write what their number is while it is not used, 0 for metal
             paint(Slot::Roughness, said.map_roughness, [1.0; 3]);
@@ -228,6 +239,30 @@ impl Libraries<'_> {
             self.unsupported(&entry.place, format!("a map on the glass \"{}\"", entry.name), "clear glass");
         }
         (bsdf, detail)
+    }
+
+    /// What the model that was chosen has no place for.
+    fn note_unused(&mut self, entry: &Entry, said: &Said, is_glass: bool, extends: bool) {
+        let highlight = said.specular.is_some() || said.map_specular.is_some() || said.exponent.is_some();
+        let others = [said.metallic, said.sheen, said.clearcoat, said.clearcoat_roughness, said.anisotropic];
+        let found = [
+            (extends && !is_glass && highlight, "Ks, map_Ks and Ns say nothing beside Pr, Pm, Ps, Pc, Pcr, aniso"),
+            (!is_glass && said.filter.is_some(), "Tf is passed over: illum (4, 6 or 7) does not say glass"),
+            (
+                !is_glass && !extends && said.index.is_some_and(|i| i != 1.0),
+                "Ni is passed over where neither illum (4, 6 or 7) says glass nor Pr, Pm, .. say a coat",
+            ),
+            (
+                said.illum == Some(9),
+                "illum 9 (glass without reflections) is read as a surface with a highlight and its d",
+            ),
+            (is_glass && others.iter().any(Option::is_some), "Pm, Ps, Pc, Pcr and aniso say nothing of glass"),
+            (is_glass && said.opacity.is_some_and(|d| d < 1.0), "d says nothing of glass: Tf is what passes"),
+            (is_glass && (said.diffuse.is_some() || highlight), "Kd, Ks and Ns say nothing of glass"),
+        ];
+        for (_, text) in found.iter().filter(|(unused, _)| *unused) {
+            self.note(&entry.place, (*text).into());
+        }
     }
 
     /// A colour; one that is not RGB is unsupported.

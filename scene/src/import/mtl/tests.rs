@@ -227,3 +227,41 @@ fn damaged_libraries_are_errors_or_materials() {
     });
     assert!(rounds.is_none_or(|n| read > n / 20 && read < n), "{read} of {rounds:?}");
 }
+
+/// Statements that the chosen model has no place for are told, once for each library, and not where they say what is so anyway.
+#[test]
+fn what_says_nothing_has_a_note() {
+    for (statements, part) in [
+        ("Kd 0.5\nKs 0.1\nNs 10\nPr 0.3", "Ks, map_Ks and Ns say nothing beside Pr"),
+        ("Kd 0.5\nTf 0.5 0.5 0.5", "Tf is passed over"),
+        ("Kd 0.5\nNi 1.45", "Ni is passed over"),
+        ("Kd 0.5\nKs 0.5\nillum 9\nd 0.5", "illum 9"),
+        ("illum 7\nNi 1.5\nPm 1", "say nothing of glass"),
+        ("illum 7\nNi 1.5\nd 0.5", "d says nothing of glass"),
+        ("illum 4\nNi 1.5\nKs 0.5", "Kd, Ks and Ns say nothing of glass"),
+        ("Kd 0.5\nmap_d a.png", "alpha channel"),
+    ] {
+        let dir = folder();
+        let mut image = vec![];
+        let mut encoder = png::Encoder::new(&mut image, 1, 1);
+        encoder.set_color(png::ColorType::Rgba);
+        encoder.write_header().unwrap().write_image_data(&[128; 4]).unwrap();
+        write(&dir, "a.png", &image);
+        write(&dir, "a.mtl", format!("newmtl m\n{statements}\nnewmtl n\n{statements}\n"));
+        let path = write(&dir, "a.obj", format!("mtllib a.mtl\n{TRIANGLE}usemtl m\nf 1/1 2/2 3/3\n"));
+        let notes = import(&path, &ImportOptions::default()).unwrap().notes;
+        let found: Vec<_> = notes.iter().filter(|n| n.text.contains(part)).collect();
+        assert_eq!(found.len(), 1, "{statements}: {notes:?}");
+        assert!(found[0].place.line == 1 || statements.contains("map_d"), "{notes:?}");
+    }
+    for statements in [
+        "Kd 0.5",
+        "Kd 0.5\nNi 1",
+        "Kd 0.5\nKs 0.1\nNs 10\nd 0.5",
+        "Kd 0.5\nPr 0.4\nNi 1.4",
+        "illum 7\nNi 1.5\nTf 1 0.5 0.5\nPr 0.2",
+        "Kd 0.5\nmap_d g.png",
+    ] {
+        assert_eq!(described(statements).0.notes, [], "{statements}");
+    }
+}

@@ -1,0 +1,256 @@
+//! Every model with random parameters: samples follow the density, where lobes are narrow too; single directions have Fresnel's share; no energy is made.
+
+use glam::{DVec3, Vec3};
+
+use super::tests::{any_principled, clear_plastic, crossing, follows_density, glass, local, rough, rough_plastic};
+use super::*;
+use crate::testing::{Rng, chi_square};
+
+/// Models that have a density.
+const KINDS: [&str; 6] = ["diffuse", "rough metal", "rough glass", "plastic", "rough plastic", "phong"];
+
+/// One of [`KINDS`], with lobes wide enough for a quadrature over directions. Principled has a test of its own.
+fn any(kind: usize, rng: &mut Rng) -> Bsdf {
+    let distribution = if rng.u32() & 1 == 0 { Distribution::Beckmann } else { Distribution::Ggx };
+    let eta = rng.range(1.1, 2.4);
+    let mut color = || [rng.f32(), rng.f32(), rng.f32()];
+    let (diffuse, specular) = (color(), color());
+    match kind {
+        0 => Bsdf::Diffuse { reflectance: diffuse },
+        1 => {
+            let alpha = [rng.range(0.25, 1.0), rng.range(0.25, 1.0)];
+            let (eta, k) = ([eta; 3], [rng.range(0.0, 5.0); 3]);
+            Bsdf::RoughConductor { distribution, alpha, eta, k, specular }
+        }
+        2 => {
+            let alpha = [rng.range(0.5, 1.0), rng.range(0.5, 1.0)];
+            let eta = if rng.u32() & 1 == 0 { eta } else { 1.0 / eta };
+            Bsdf::RoughDielectric { distribution, alpha, eta, reflect: diffuse, transmit: specular }
+        }
+        3 => Bsdf::Plastic { eta, diffuse, specular, nonlinear: rng.u32() & 1 == 0 },
+        4 => rough_plastic(distribution, rng.range(0.2, 1.0), eta, diffuse[0], rng.u32() & 1 == 0),
+        _ => Bsdf::Phong { diffuse, specular, exponent: rng.range(0.0, 60.0) },
+    }
+}
+
+/// A view from straight above to half a degree over the surface.
+fn any_view(rng: &mut Rng) -> Vec3 {
+    local(rng.range(0.0, 1.0).sqrt() * 1.56, rng.range(-3.1, 3.1))
+}
+
+#[test]
+fn samples_follow_the_density_of_any_model() {
+    let mut rng = Rng(21);
+    for (kind, name) in KINDS.iter().enumerate() {
+        let (mut compared, all) = (0, 14);
+        for _ in 0..all {
+            let (bsdf, wo) = (any(kind, &mut rng), any_view(&mut rng));
+            let front = rng.u32() & 3 != 0 || !bsdf.transmits();
+            let midpoints = if bsdf.transmits() { 45 } else { 30 };
+            compared += u32::from(follows_density(&bsdf, front, wo, 50_000, midpoints, &mut rng));
+        }
+        println!("{name}: {compared} of {all} compared bin by bin");
+        assert!(4 * compared >= 3 * all, "{name}: {compared} of {all}");
+    }
+}
+
+/// Bins of slopes, in units of the roughness: by u, where r^2 = u / (1 - u), up to this, and by angle.
+const MOST_U: f64 = 0.9;
+const BINS: [usize; 2] = [6, 8];
+
+/// The bin of a microfacet's slope; none beyond them.
+fn slope_bin(m: DVec3, alpha: [f32; 2]) -> Option<usize> {
+    let (x, y) = (m.x / m.z / f64::from(alpha[0]), m.y / m.z / f64::from(alpha[1]));
+    let r2 = x * x + y * y;
+    let ring = (r2 / (1.0 + r2) / MOST_U * BINS[0] as f64) as usize;
+    let turn = (y.atan2(x) / std::f64::consts::TAU + 0.5) * BINS[1] as f64;
+    (m.z > 0.0 && ring < BINS[0]).then(|| ring * BINS[1] + (turn as usize).min(BINS[1] - 1))
+}
+
+fn reflected(wo: DVec3, m: DVec3) -> DVec3 {
+    2.0 * wo.dot(m) * m - wo
+}
+
+/// Samples of a narrow lobe as microfacets, which are as wide as the roughness is, whatever that is: their slopes follow the density, changed to slopes
+/// by the Jacobians of reflection and refraction (Walter et al. 2007, equations 14 and 17). `eta` is the index below over that above.
+fn slopes_follow_the_density(bsdf: &Bsdf, front: bool, wo: Vec3, alpha: [f32; 2], eta: f64, rng: &mut Rng) {
+    let n = 40_000;
+    let (o, cells) = (wo.as_dvec3().normalize(), BINS[0] * BINS[1]);
+    let mut counts = vec![0.0; cells + 1];
+    for _ in 0..n {
+        let bin = bsdf.sample(wo, front, [rng.f32(), rng.f32()], rng.f32()).and_then(|s| {
+            let i = s.wi.as_dvec3();
+            let m = if i.z > 0.0 { o + i } else { o + i * eta };
+            slope_bin((m * m.z.signum()).normalize(), alpha)
+        });
+        counts[bin.unwrap_or(cells)] += 1.0;
+    }
+    let density = |m: DVec3| {
+        let cos = o.dot(m);
+        if cos <= 0.0 {
+            return 0.0;
+        }
+        let pdf = |wi: DVec3| f64::from(bsdf.eval(wo, wi.as_vec3().normalize(), front).pdf);
+        let up = reflected(o, m);
+        let mut sum = if up.z > 0.0 { pdf(up) * 4.0 * cos } else { 0.0 };
+        let cos2_t = 1.0 - (1.0 - cos * cos) / (eta * eta);
+        if bsdf.transmits() && cos2_t > 0.0 {
+            let cos_t = cos2_t.sqrt();
+            let down = m * (cos / eta - cos_t) - o / eta;
+            let both = cos - eta * cos_t;
+            sum += if down.z < 0.0 { pdf(down) * both * both / (eta * eta * cos_t) } else { 0.0 };
+        }
+        sum
+    };
+    let k = 12;
+    let mut expected = vec![0.0; cells + 1];
+    for i in 0..BINS[0] * k {
+        let u = (i as f64 + 0.5) / (BINS[0] * k) as f64 * MOST_U;
+        let r = (u / (1.0 - u)).sqrt();
+        // r dr = du / 2 (1 - u)^2
+        let ring = MOST_U / (BINS[0] * k) as f64 / (2.0 * (1.0 - u) * (1.0 - u));
+        for j in 0..BINS[1] * k {
+            let turn = ((j as f64 + 0.5) / (BINS[1] * k) as f64 - 0.5) * std::f64::consts::TAU;
+            let (x, y) = (r * turn.cos() * f64::from(alpha[0]), r * turn.sin() * f64::from(alpha[1]));
+            let m = DVec3::new(x, y, 1.0).normalize();
+            let area = ring * std::f64::consts::TAU / (BINS[1] * k) as f64 * f64::from(alpha[0] * alpha[1]);
+            expected[i / k * BINS[1] + j / k] += density(m) * area * m.z.powi(3);
+        }
+    }
+    let sum: f64 = expected.iter().sum();
+    assert!(sum < 1.003, "{bsdf:?} {front} {wo}: {sum} within the bins");
+    expected[cells] = 1.0 - sum.min(1.0);
+    expected.iter_mut().for_each(|e| *e *= f64::from(n));
+    println!("{bsdf:?} {front} {wo}: {sum:.4} within the bins");
+    chi_square(&counts, &expected);
+}
+
+#[test]
+fn narrow_lobes_follow_their_density() {
+    let mut rng = Rng(22);
+    let mut compared = 0;
+    for distribution in [Distribution::Beckmann, Distribution::Ggx] {
+        for alpha in [[0.001; 2], [0.01; 2], [0.05; 2], [0.15; 2], [0.02, 0.1], [0.1, 0.003]] {
+            for wo in [local(0.0, 0.0), local(0.6, 0.7), local(1.1, -2.0)] {
+                let eta = rng.range(1.2, 2.0);
+                let mut check = |bsdf: Bsdf, front: bool, eta: f32| {
+                    slopes_follow_the_density(&bsdf, front, wo, alpha, f64::from(eta), &mut rng);
+                    compared += 1;
+                };
+                check(rough(distribution, alpha), true, 1.0);
+                check(glass(distribution, alpha, eta), true, eta);
+                check(glass(distribution, alpha, eta), false, 1.0 / eta);
+                if alpha[0] == alpha[1] {
+                    check(rough_plastic(distribution, alpha[0], eta, 0.4, false), true, 1.0);
+                }
+            }
+        }
+    }
+    assert_eq!(compared, 2 * 3 * (6 * 3 + 4));
+}
+
+/// Interfaces that reflect and let pass single directions: each as often, times its weight, as Fresnel's equations say.
+#[test]
+fn single_directions_have_their_share() {
+    let mut rng = Rng(23);
+    for i in 0..120 {
+        let (eta, front) = (rng.range(0.5, 2.5), rng.u32() & 1 == 0);
+        let (reflect, transmit) = ([rng.f32(); 3], [rng.f32(); 3]);
+        let wo = any_view(&mut rng);
+        let (bsdf, share) = match i % 3 {
+            0 => {
+                let (r, _) = dielectric::fresnel(wo.z, relative(eta, front));
+                (Bsdf::Dielectric { eta, reflect, transmit }, [r * reflect[0], (1.0 - r) * transmit[0]])
+            }
+            1 => {
+                // there and back within the pane, without end
+                let (r, _) = dielectric::fresnel(wo.z, relative(eta.max(1.0), true));
+                let r = 2.0 * r / (1.0 + r);
+                (
+                    Bsdf::ThinDielectric { eta: eta.max(1.0), reflect, transmit },
+                    [r * reflect[0], (1.0 - r) * transmit[0]],
+                )
+            }
+            _ => {
+                let eta = eta.max(1.05);
+                let (r, _) = dielectric::fresnel(wo.z, eta);
+                (Bsdf::Plastic { eta, diffuse: transmit, specular: reflect, nonlinear: false }, [r * reflect[0], 0.0])
+            }
+        };
+        let n = 20_000;
+        let (mut sums, mut squares) = ([0.0f64; 2], [0.0f64; 2]);
+        for _ in 0..n {
+            if let Some(Sampled { wi, delta: Some(w) }) = bsdf.sample(wo, front, [rng.f32(), rng.f32()], rng.f32()) {
+                let below = usize::from(wi.z < 0.0);
+                let w = f64::from(w.x * crossing(&bsdf, front, wi));
+                sums[below] += w;
+                squares[below] += w * w;
+            }
+        }
+        for side in 0..2 {
+            let mean = sums[side] / f64::from(n);
+            let error = ((squares[side] / f64::from(n) - mean * mean).max(0.0) / f64::from(n)).sqrt();
+            let expected = f64::from(share[side]);
+            assert!((mean - expected).abs() < 5.0 * error + 1e-4, "{bsdf:?} {front} {wo} {side}: {mean} {expected}");
+        }
+    }
+}
+
+/// What a white sky is reflected and let through to, by sampling.
+fn albedo(bsdf: &Bsdf, front: bool, wo: Vec3, n: u32, rng: &mut Rng) -> f64 {
+    let mut sum = 0.0;
+    for _ in 0..n {
+        let Some(s) = bsdf.sample(wo, front, [rng.f32(), rng.f32()], rng.f32()) else { continue };
+        sum += match s.delta {
+            Some(w) => f64::from(w.x * crossing(bsdf, front, s.wi)),
+            None => {
+                let e = bsdf.eval(wo, s.wi, front);
+                if e.pdf > 0.0 { f64::from(e.value.x / e.pdf * crossing(bsdf, front, s.wi)) } else { 0.0 }
+            }
+        };
+    }
+    sum / f64::from(n)
+}
+
+/// White surfaces of random parameters under a white sky. `principled` is Mitsuba's, which makes some: its diffuse lobe gives back up to 1.07 where it is
+/// rough and seen at a grazing angle, and sheen and clearcoat are added to it.
+#[test]
+fn no_model_makes_energy() {
+    let mut rng = Rng(24);
+    let mut most = [0.0f64; 3];
+    for i in 0..400 {
+        let wo = any_view(&mut rng);
+        let mut p = any_principled(&mut rng);
+        (p.base_color, p.roughness) = ([1.0; 3], rng.range(0.05, 1.0));
+        let kind = i % 3;
+        if kind < 2 {
+            (p.sheen, p.clearcoat) = (0.0, 0.0);
+        }
+        if kind < 1 {
+            (p.metallic, p.spec_trans) = if rng.u32() & 1 == 0 { (1.0, 0.0) } else { (0.0, 1.0) };
+        }
+        let front = p.spec_trans == 0.0 || rng.u32() & 1 == 0;
+        let found = albedo(&Bsdf::Principled(p), front, wo, 20_000, &mut rng);
+        most[kind] = most[kind].max(found);
+    }
+    println!(
+        "principled: metal or glass {:.4}, without sheen and coat {:.4}, with all {:.4}",
+        most[0], most[1], most[2]
+    );
+    for (kind, name) in KINDS.iter().enumerate() {
+        let mut most = 0.0f64;
+        for _ in 0..60 {
+            let mut bsdf = any(kind, &mut rng);
+            for slot in [Slot::Diffuse, Slot::Specular, Slot::Transmit] {
+                bsdf.color_mut(slot).into_iter().for_each(|color| *color = [1.0; 3]);
+            }
+            let front = rng.u32() & 1 == 0 || !bsdf.transmits();
+            most = most.max(albedo(&bsdf, front, any_view(&mut rng), 20_000, &mut rng));
+        }
+        println!("{name}: {most:.4}");
+        assert!(most < 1.02, "{name}: {most}");
+    }
+    let smooth = albedo(&clear_plastic(1.5, 1.0, true), true, local(0.5, 0.0), 20_000, &mut rng);
+    assert!(smooth < 1.02, "{smooth}");
+    assert!(most[0] < 1.005 && most[1] < 1.2 && most[2] < 2.0, "{most:?}");
+}
