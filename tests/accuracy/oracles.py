@@ -17,7 +17,7 @@ SPP, RENDERS = 4096, 8
 
 def main() -> None:
     p = argparse.ArgumentParser(description=__doc__)
-    p.add_argument("names", nargs="*", default=[*scenes.MATERIALS, *scenes.EMITTERS, *features.FEATURES])
+    p.add_argument("names", nargs="*", default=[*scenes.MATERIALS, *scenes.EMITTERS, *features.ORACLES])
     p.add_argument("--rayherd", required=True, help="makes those scenes that `rayherd scene` makes")
     p.add_argument("--shared", type=Path, required=True)
     p.add_argument("--work", type=Path, required=True)
