@@ -301,7 +301,7 @@ pub enum Done {
         skipped: SkipCounts,
         /// What its stages cost, if the stage asks for it.
         #[serde(default, skip_serializing_if = "Option::is_none")]
-        profile: Option<Profile>,
+        profile: Option<Box<Profile>>,
     },
     /// Of a merge.
     Merged {

@@ -389,7 +389,7 @@ impl<'l> Station<'l> {
                 let attempt = Attempt { node: self.node(), ..attempt.clone() };
                 let made = attempt::run(shared, &attempt, stop)?;
                 let attempt::Made { outputs, hops, skipped, profile, .. } = made;
-                Ok(Done::Made { outputs, hops, skipped, profile })
+                Ok(Done::Made { outputs, hops, skipped, profile: profile.map(Box::new) })
             }
             Work::Merge { name, parts, spp, picture, band } => {
                 let (stage, shared) = open()?;

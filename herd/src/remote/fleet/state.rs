@@ -296,7 +296,7 @@ impl State {
         match result {
             Ok(Done::Made { outputs, hops, skipped, profile }) => {
                 self.succeeded();
-                Ok(Made { outputs, film: None, hops, skipped, profile })
+                Ok(Made { outputs, film: None, hops, skipped, profile: profile.map(|p| *p) })
             }
             Ok(_) => Err(JobError::Internal("a worker reports something else than it was to do".into())),
             Err(Failure::Stopped) => Err(JobError::Stopped),

@@ -31,7 +31,8 @@ impl Converter<'_> {
             }
             "roughdielectric" => {
                 // read for what is wrong with them
-                (self.distribution(id)?, self.roughness(id, &mut Textures::new())?);
+                self.distribution(id)?;
+                self.roughness(id, &mut Textures::new())?;
                 self.ignore(id, &["sample_visible"]);
                 let place = &self.document.objects[id].place;
                 self.note(place, "roughdielectric between equal indices: light passes unbent, whatever its roughness");
