@@ -6,7 +6,7 @@
 use std::path::Path;
 
 use rayherd_scene::ImportError;
-use rayherd_scene::import::{DescriptionSource, ImportOptions, StreamOptions, import, sky_map};
+use rayherd_scene::import::{DescriptionSource, ImportOptions, StreamOptions, Survey, import, sky_map};
 use rayherd_scene::record::RecordSource;
 use rayherd_tests::mutation;
 
@@ -44,6 +44,8 @@ fn read(path: &Path, substitute: bool) -> Result<usize, ImportError> {
     let options = ImportOptions { substitute, ..ImportOptions::default() };
     let description = import(path, &options)?;
     sky_map(description.environment.as_ref())?;
+    // textures, and what the camera sees
+    Survey::of(&description);
     let stream_options = StreamOptions { vertex_budget: 1 << 16, spill_limit: 1 << 20, ..StreamOptions::default() };
     let source = DescriptionSource::new(&description, stream_options);
     let mut stream = source.open()?;
@@ -58,7 +60,7 @@ fn read(path: &Path, substitute: bool) -> Result<usize, ImportError> {
     }
 }
 
-fn fuzz(name: &str, seeds: &[Vec<u8>], beside: &[(&str, &str)]) {
+fn fuzz(name: &str, seeds: &[Vec<u8>], beside: &[(&str, &[u8])]) {
     let dir = tempfile::tempdir().unwrap();
     for (name, content) in beside {
         std::fs::write(dir.path().join(name), content).unwrap();
@@ -138,7 +140,7 @@ fn packed() {
 fn obj() {
     let text = "mtllib a.mtl\no a\nv 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nvt 0.5 0.5\nvn 0 0 1\nusemtl red\nf 1 2 3 4\nusemtl blue\nf -4/1 -3/1 \\\n-2/1\n\
                 f 1//1 2//1 3//1\nf 1/1/1 2/1/1 4/1/1\n";
-    fuzz("a.obj", &[text.into()], &[("a.mtl", "newmtl red\nKd 1 0 0\nKe 1 1 1\nnewmtl blue\nillum 7\n")]);
+    fuzz("a.obj", &[text.into()], &[("a.mtl", b"newmtl red\nKd 1 0 0\nKe 1 1 1\nnewmtl blue\nillum 7\n")]);
 }
 
 #[test]
@@ -151,6 +153,45 @@ fn stl() {
         binary.extend([0, 0]);
     }
     fuzz("a.stl", &[text.into(), binary], &[]);
+}
+
+/// Four texels.
+fn exr() -> Vec<u8> {
+    use exr::prelude::WritableImage;
+    let channels = exr::prelude::SpecificChannels::rgb(|at: exr::math::Vec2<usize>| (at.0 as f32, at.1 as f32, 1f32));
+    let mut bytes = std::io::Cursor::new(vec![]);
+    exr::prelude::Image::from_channels((2, 2), channels).write().to_buffered(&mut bytes).unwrap();
+    bytes.into_inner()
+}
+
+/// Four texels, grey.
+fn png() -> Vec<u8> {
+    let mut bytes = vec![];
+    let mut encoder = png::Encoder::new(&mut bytes, 2, 2);
+    encoder.set_color(png::ColorType::Grayscale);
+    encoder.write_header().unwrap().write_image_data(&[0, 80, 160, 255]).unwrap();
+    bytes
+}
+
+/// A triangle of version 4, in single precision, with texture coordinates.
+fn serialized() -> Vec<u8> {
+    use std::io::Write;
+    let mut packer = flate2::write::ZlibEncoder::new(vec![], flate2::Compression::default());
+    let mut data = 0x1002u32.to_le_bytes().to_vec();
+    data.extend(b"a\0");
+    data.extend([3u64, 1].iter().flat_map(|n| n.to_le_bytes()));
+    data.extend(
+        [0f32, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 1.0]
+            .iter()
+            .flat_map(|x| x.to_le_bytes()),
+    );
+    data.extend([0u32, 1, 2].iter().flat_map(|i| i.to_le_bytes()));
+    packer.write_all(&data).unwrap();
+    let mut out = [0x1c, 4, 4, 0].to_vec();
+    out.extend(packer.finish().unwrap());
+    out.extend(0u64.to_le_bytes());
+    out.extend(1u32.to_le_bytes());
+    out
 }
 
 #[test]
@@ -187,9 +228,37 @@ fn mitsuba() {
 <shape type="cylinder"><point name="p0" value="0 0 1"/><point name="p1" value="0 2 1"/><float name="radius" value="0.5"/></shape></scene>"#;
     let sky = "#?RGBE\nFORMAT=32-bit_rle_rgbe\n\n-Y 2 +X 2\nabc\u{7f}def\u{7f}ghi\u{7f}jkl\u{7f}";
     let heated = PLY.replace("uchar red", "float heat_x");
-    fuzz(
-        "a.xml",
-        &[text.into(), more.into()],
-        &[("part.xml", part), ("a.ply", PLY), ("b.ply", &heated), ("sky.hdr", sky)],
-    );
+    // every material and texture, the sky's model, layers
+    let rest = r#"<scene version="3.0.0"><integrator type="aov"><string name="aovs" value="dd.y:depth, n:sh_normal"/><integrator type="path">
+<integer name="max_depth" value="-1"/></integrator></integrator>
+<sensor type="orthographic"><transform name="to_world"><scale x="3" y="3"/><translate z="-5"/></transform><float name="near_clip" value="1"/>
+<sampler type="independent"><integer name="sample_count" value="4"/></sampler></sensor>
+<emitter type="sunsky"><float name="turbidity" value="4"/><vector name="sun_direction" x="0.1" y="0.2" z="0.9"/></emitter>
+<texture type="bitmap" id="t"><string name="filename" value="a.png"/><string name="wrap_mode" value="mirror"/><boolean name="raw" value="true"/>
+<string name="filter_type" value="nearest"/><transform name="to_uv"><scale x="2" y="3"/></transform></texture>
+<bsdf type="blendbsdf" id="b"><float name="weight" value="0.3"/><bsdf type="phong"><float name="exponent" value="9"/></bsdf>
+<bsdf type="dielectric"><string name="int_ior" value="bk7"/></bsdf></bsdf><alias id="b" as="c"/><alias id="c" as="d"/>
+<bsdf type="twosided" id="e"><bsdf type="bumpmap"><ref id="t"/><float name="scale" value="0.1"/><bsdf type="roughplastic">
+<float name="alpha" value="0.2"/><ref id="t" name="diffuse_reflectance"/></bsdf></bsdf><bsdf type="normalmap"><ref id="t"/>
+<bsdf type="conductor"><string name="material" value="Au"/></bsdf></bsdf></bsdf>
+<bsdf type="mask" id="f"><ref id="t" name="opacity"/><bsdf type="principled"><rgb name="base_color" value="0.1 0.2 0.3"/><float name="roughness" value="0.4"/>
+<float name="spec_trans" value="0.5"/><float name="clearcoat" value="1"/><float name="eta" value="1.4"/></bsdf></bsdf>
+<shape type="cube"><ref id="d"/></shape><shape type="serialized"><string name="filename" value="a.serialized"/><integer name="shape_index" value="0"/>
+<ref id="e"/></shape><shape type="sphere"><ref id="f"/></shape><shape type="rectangle"><bsdf type="roughdielectric"><string name="distribution"
+value="ggx"/><float name="alpha_u" value="0.1"/><float name="alpha_v" value="0.2"/></bsdf></shape>
+<shape type="disk"><bsdf type="null"/></shape><shape type="cube"><bsdf type="thindielectric"/></shape>
+<shape type="cube"><bsdf type="plastic"><boolean name="nonlinear" value="true"/></bsdf></shape></scene>"#;
+    let envmap = "<scene version=\"0.6.0\"><sensor type=\"perspective\"/><shape type=\"cube\"><bsdf type=\"roughconductor\"><spectrum name=\"eta\" \
+                  value=\"1.5\"/><string name=\"material\" value=\"Cu\"/></bsdf></shape><emitter type=\"envmap\"><string name=\"filename\" \
+                  value=\"sky.exr\"/></emitter></scene>";
+    let files: &[(&str, &[u8])] = &[
+        ("part.xml", part.as_bytes()),
+        ("a.ply", PLY.as_bytes()),
+        ("b.ply", heated.as_bytes()),
+        ("sky.hdr", sky.as_bytes()),
+        ("sky.exr", &exr()),
+        ("a.png", &png()),
+        ("a.serialized", &serialized()),
+    ];
+    fuzz("a.xml", &[text.into(), more.into(), rest.into(), envmap.into()], files);
 }

@@ -33,9 +33,6 @@ COPPER = ('<bsdf type="roughconductor"><string name="material" value="Cu"/><stri
 SPREAD = '<scale x="2.5" y="1.5"/><translate x="-0.6" y="-0.2"/>'
 PAINT = "paint.png"
 
-# of a plate alone, beside a ball of another material: at a ball's rim, and at its poles, a relief turns normals away from the ray, where ours differs on
-# purpose (docs/formats.md): all over a ball and a plate it is 0.2 % more light
-ON_PLATE = ["bumpmap", "normalmap"]
 # a ball and a plate of these
 MATERIALS = {
     "mask": f'<bsdf type="mask"><float name="opacity" value="0.4"/>{two(RED)}</bsdf>',
@@ -120,7 +117,7 @@ ORACLES = [
 def text(name: str, size: int) -> str:
     """The scene, for pictures of `size` x `size` pixels."""
     if name in MATERIALS:
-        return scenes.SMALL.replace("MATERIAL", RED, 1 if name in ON_PLATE else 0).replace("MATERIAL", MATERIALS[name])
+        return scenes.SMALL.replace("MATERIAL", MATERIALS[name])
     beside, lens, film, integrator = OTHERS[name]
     out = scenes.LIT.replace("SENSOR", "perspective").replace("LENS", lens).replace("EMITTER", beside).replace('<scale x="2" y="2"/>', "")
     out = out.replace("</integrator>", integrator + "</integrator>")

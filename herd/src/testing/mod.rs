@@ -173,7 +173,7 @@ pub fn textured(folder: &Path) -> Description {
         nonlinear: true,
         coat,
     };
-    let relief = Some(Relief { kind: ReliefKind::Bump(0.002), texture: 1, mirrored: false });
+    let relief = Some(Relief { kind: ReliefKind::Bump(0.002), texture: 1, mirrored: false, shadowed: true });
     let grey = Bsdf::Diffuse { reflectance: [0.6; 3] };
     let details = [
         (grey.clone(), Detail { textured: painted(0), ..Detail::default() }),

@@ -90,6 +90,10 @@ pub struct Relief {
     pub texture: u32,
     /// Seen from behind it is the mirror image of the front (`twosided` around it), not its other side (inside of it).
     pub mirrored: bool,
+    /// Light that comes in flat is dimmed by how far the normal is turned, so that relief does not end light at an edge (Estevez, Lecocq and Stein,
+    /// "A microfacet-based shadowing function to solve the bump terminator problem", Ray Tracing Gems, 2019): Mitsuba 3's `use_shadowing_function`.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub shadowed: bool,
 }
 
 /// How a texture says where the normal points.

@@ -2,6 +2,7 @@
 
 use super::Surface;
 use super::vertex::select;
+use crate::material::Relief;
 use crate::math::{Basis, Position, gamma, offset_origin};
 use crate::ray::Hit;
 use crate::real::consts::PI;
@@ -52,6 +53,9 @@ pub(super) struct Interaction {
     pub shading: Vec3,
     /// Whether the ray came from the front.
     pub from_front: bool,
+    /// The shading normal before relief turned it, and what [`Interaction::terminator`] takes for the square of a roughness; 0 without.
+    even: Vec3,
+    alpha2: f32,
 }
 
 impl Interaction {
@@ -104,7 +108,7 @@ impl Interaction {
             None => normal,
             Some(normals) => smooth(normals.map(Vec3::from), hit.u, hit.v, normal, d),
         };
-        Some(Interaction { position, front, normal, shading, from_front })
+        Some(Interaction { position, front, normal, shading, from_front, even: shading, alpha2: 0.0 })
     }
 
     /// The point.
@@ -159,37 +163,57 @@ impl Interaction {
     }
 
     /// Turns the shading normal to that of a height field of this gradient by u and v above the surface (Blinn 1978, without the derivative
-    /// of the normal, as Mitsuba has it); it stays where the ray would see the turned one from behind.
-    pub(super) fn bump(&mut self, surface: &Surface, gradient: [f32; 2], mirrored: bool, d: Vec3) {
+    /// of the normal, as Mitsuba has it).
+    pub(super) fn bump(&mut self, surface: &Surface, gradient: [f32; 2], relief: &Relief, d: Vec3) {
         let n = if self.from_front { self.shading } else { -self.shading };
         let [du, dv] = self.partials(surface);
         let raise = |tangent: Vec3, slope: f32| tangent + n * (slope - n.dot(tangent));
         let m = raise(du, gradient[0]).cross(raise(dv, gradient[1]));
-        self.turn(n, if m.dot(self.front) < 0.0 { -m } else { m }, mirrored, d);
+        self.turn(n, if m.dot(self.front) < 0.0 { -m } else { m }, relief, d);
     }
 
     /// Turns the shading normal to `local`, in the frame of the derivative by u and the normal of the front.
-    pub(super) fn turn_to(&mut self, surface: &Surface, local: Vec3, mirrored: bool, d: Vec3) {
+    pub(super) fn turn_to(&mut self, surface: &Surface, local: Vec3, relief: &Relief, d: Vec3) {
         let n = if self.from_front { self.shading } else { -self.shading };
         let m = Basis::with_tangent(n, self.partials(surface)[0]).to_world(local);
-        self.turn(n, m, mirrored, d);
+        self.turn(n, m, relief, d);
     }
 
-    /// From the front's normal `n` to `m`, of any length.
-    fn turn(&mut self, n: Vec3, m: Vec3, mirrored: bool, d: Vec3) {
+    /// From the front's normal `n` to `m`, of any length. One that points below the surface leaves the shading normal as it was.
+    fn turn(&mut self, n: Vec3, m: Vec3, relief: &Relief, d: Vec3) {
         let length = m.length();
         if !(length > 0.0 && length.is_finite()) {
             return;
         }
         let m = m / length;
-        let m = match (self.from_front, mirrored) {
+        let m = match (self.from_front, relief.mirrored) {
             (true, _) => m,
             (false, false) => -m,
             (false, true) => m - n * (2.0 * n.dot(m)),
         };
+        // one that the ray would see from behind leans as far the other way (Mitsuba's `flip_invalid_normals`)
+        let m = if m.dot(d) < 0.0 { m } else { n * (2.0 * n.dot(m)) - m };
         if m.dot(d) < 0.0 {
             self.shading = m;
+            if relief.shadowed {
+                let cos = n.dot(m).abs().min(1.0);
+                // the slope's square over 8: the roughness of a surface whose slopes are mostly below it; 1 where the two are at right angles
+                self.alpha2 = ((1.0 - cos * cos) / (cos * cos) * 0.125).min(1.0);
+            }
         }
+    }
+
+    /// What the turning of the shading normal leaves of light from, or to, a unit direction: 1 straight above the surface, and where nothing was turned,
+    /// less the flatter it comes (GGX's masking; the paper named at `Relief::shadowed`).
+    #[inline(always)]
+    pub(super) fn terminator(&self, wi: Vec3) -> f32 {
+        if self.alpha2 == 0.0 {
+            return 1.0;
+        }
+        let cos = self.even.dot(wi);
+        // Mitsuba's least cosine is 1e-6
+        let cos2 = (cos * cos).clamp(1e-12, 1.0);
+        2.0 / (1.0 + (1.0 + self.alpha2 * ((1.0 - cos2) / cos2)).sqrt())
     }
 
     /// The shading frame; its tangents follow the surface's parametrisation when `tangents` asks for it.
@@ -244,6 +268,10 @@ mod tests {
     use super::*;
     use crate::testing::Rng;
 
+    fn relief(mirrored: bool) -> Relief {
+        Relief { kind: crate::material::ReliefKind::Normals, texture: 0, mirrored, shadowed: false }
+    }
+
     fn hit(u: f32, v: f32) -> Hit {
         Hit { t: 1.0, u, v, prim: 0, leaf: 0, lane: 0 }
     }
@@ -280,7 +308,7 @@ mod tests {
             for (side, mirrored) in [(1.0, false), (-1.0, false), (-1.0, true)] {
                 let d = (n * -side).as_vec3();
                 let mut at = Interaction::new(Vec3::ZERO, d, &hit(0.2, 0.3), &surface).unwrap();
-                at.bump(&surface, gradient, mirrored, d);
+                at.bump(&surface, gradient, &relief(mirrored), d);
                 let expected: DVec3 = match (side > 0.0, mirrored) {
                     (true, _) => up,
                     (false, false) => -up,
@@ -301,12 +329,15 @@ mod tests {
         let d = Vec3::new(0.1, 0.2, -1.0).normalize();
         let mut at = Interaction::new(Vec3::Z, d, &hit(0.2, 0.3), &surface).unwrap();
         assert_eq!(at.place(&surface, &hit(0.2, 0.3)).uv, [0.2, 0.3]);
-        at.turn_to(&surface, Vec3::new(0.6, 0.0, 1.6), false, d);
+        at.turn_to(&surface, Vec3::new(0.6, 0.0, 1.6), &relief(false), d);
         assert!((at.shading - Vec3::new(0.6, 0.0, 1.6).normalize()).length() < 1e-6, "{}", at.shading);
-        // seen from behind by the ray, or of no length: it stays
-        for local in [Vec3::new(0.0, 1.0, 0.0), Vec3::ZERO, Vec3::NAN] {
+        // seen from behind by the ray it leans the other way; below the surface, or of no length, it stays
+        let mut at = Interaction::new(Vec3::Z, d, &hit(0.2, 0.3), &surface).unwrap();
+        at.turn_to(&surface, Vec3::new(0.1, 0.9, 0.1), &relief(false), d);
+        assert!((at.shading - Vec3::new(-0.1, -0.9, 0.1).normalize()).length() < 1e-6, "{}", at.shading);
+        for local in [Vec3::new(0.0, 0.1, -1.0), Vec3::ZERO, Vec3::NAN] {
             let mut at = Interaction::new(Vec3::Z, d, &hit(0.2, 0.3), &surface).unwrap();
-            at.turn_to(&surface, local, false, d);
+            at.turn_to(&surface, local, &relief(false), d);
             assert_eq!(at.shading, Vec3::Z);
         }
     }

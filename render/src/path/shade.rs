@@ -6,7 +6,7 @@ use super::interaction::{Interaction, triangle_place};
 use super::vertex::{Fate, cosine_direction, onwards, snap, survive, towards_light};
 use super::{Context, Contribution, Outcome, PathRay, ShadowRay, Surface, Surfaces, power_heuristic};
 use crate::light::Facing;
-use crate::material::{Blend, Bsdf, Look, Material, Relief, ReliefKind};
+use crate::material::{Blend, Bsdf, Look, Material, ReliefKind};
 use crate::math::{UnitDir, unit};
 use crate::ray::{Hit, PathKey, Ray};
 use crate::real::{Vec3, f32};
@@ -385,15 +385,17 @@ pub(super) fn scatter_plain(
         if let Some(light) = light {
             let (dir, wi) = snap(light.d);
             let radiance = context.radiance(&light);
+            let left = reflectance * at.terminator(wi);
             let contribution =
-                towards_light(throughput, reflectance, at.normal, at.shading, light.d, wi, light.pdf, radiance, true);
+                towards_light(throughput, left, at.normal, at.shading, light.d, wi, light.pdf, radiance, true);
             shadow(origin, dir, light.tmax, contribution, out);
         }
         note_unlit(out);
         let (d, above) = cosine_direction(at.shading, direction);
         let (dir, wi) = snap(d);
+        let left = reflectance * at.terminator(wi);
         let (throughput, pdf, fate) =
-            onwards(throughput, reflectance, at.normal, at.shading, wi, above, go_on, roulette, siblings);
+            onwards(throughput, left, at.normal, at.shading, wi, above, go_on, roulette, siblings);
         (origin, dir, throughput, pdf, fate)
     } else {
         let basis = at.basis(surface, bsdf.is_anisotropic());
@@ -416,7 +418,7 @@ pub(super) fn scatter_plain(
             let contribution = if same_side(wi.dot(at.normal), local.z, bsdf.transmits()) {
                 let scattered = bsdf.eval(wo, local, at.from_front);
                 let weight = power_heuristic(light.pdf, scattered.pdf * opacity) / light.pdf;
-                let value = scattered.value * opacity;
+                let value = scattered.value * (opacity * at.terminator(wi));
                 throughput * value * context.radiance(&light) * weight
             } else {
                 Vec3::ZERO
@@ -452,7 +454,13 @@ pub(super) fn scatter_plain(
                     }
                 };
                 let leaves = same_side(wi.dot(at.normal), sampled.wi.z, bsdf.transmits());
-                (dir, weight, pdf, leaves, if sampled.wi.z < 0.0 { at.origin_beyond() } else { origin })
+                (
+                    dir,
+                    weight * at.terminator(wi),
+                    pdf,
+                    leaves,
+                    if sampled.wi.z < 0.0 { at.origin_beyond() } else { origin },
+                )
             }
         };
         let (throughput, fate) = survive(throughput * weight, leaves, go_on, roulette, siblings);
@@ -496,15 +504,15 @@ pub(super) fn appearance<'a>(
         material = &world.materials[next as usize];
     };
     let Some(detail) = inner else { return (material, None, opacity) };
-    if let Some(Relief { kind, texture, mirrored }) = detail.relief {
-        let texture = &world.textures[texture as usize];
-        match kind {
+    if let Some(relief) = &detail.relief {
+        let texture = &world.textures[relief.texture as usize];
+        match relief.kind {
             ReliefKind::Bump(scale) => {
                 let gradient = texture.gradient(tiles, place.uv).map(|slope| slope * scale);
-                at.bump(surface, gradient, mirrored, d);
+                at.bump(surface, gradient, relief, d);
             }
             ReliefKind::Normals => {
-                at.turn_to(surface, texture.color(tiles, place) * 2.0 - Vec3::ONE, mirrored, d);
+                at.turn_to(surface, texture.color(tiles, place) * 2.0 - Vec3::ONE, relief, d);
             }
         }
     }

@@ -226,7 +226,7 @@ fn normals_have_their_relief() {
     let mut scene = Scene::default();
     // (0.6, 0, 0.8) in the frame of u, v and the normal: linear bytes of 2 c - 1
     let image = scene.image([1, 1], vec![204, 128, 230]);
-    let relief = Some(Relief { kind: ReliefKind::Normals, texture: image, mirrored: false });
+    let relief = Some(Relief { kind: ReliefKind::Normals, texture: image, mirrored: false, shadowed: true });
     let bumpy = scene.detailed(Bsdf::Diffuse { reflectance: [0.5; 3] }, Detail { relief, ..Detail::default() });
     board(&mut scene, bumpy);
     let frame = with(frame([0.0; 3], 20.0, [4, 4], 1), [Aov::Normal]);

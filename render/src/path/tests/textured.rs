@@ -19,7 +19,7 @@ pub fn furnish(scene: &mut Scene) {
     scene.textures.push(Texture::Checkerboard(Checkerboard { to_uv, colors }));
     let squares = scene.textures.len() as u32 - 1;
     let grey = Bsdf::Diffuse { reflectance: [0.5; 3] };
-    let relief = |kind| Some(Relief { kind, texture: image, mirrored: false });
+    let relief = |kind| Some(Relief { kind, texture: image, mirrored: false, shadowed: true });
     let back = scene.painted(squares);
     let details = [
         Detail { opacity: Amount::Constant(0.4), ..Detail::default() },
@@ -198,6 +198,7 @@ fn reliefs(scene: &mut Scene, rng: &mut Rng) -> [Relief; 2] {
         kind,
         texture,
         mirrored: true,
+        shadowed: true,
     })
 }
 
@@ -247,6 +248,8 @@ fn reliefs_leak_nothing() {
 /// ray's side everywhere. What is missing is what a bent lobe sends into the surface.
 #[test]
 fn reliefs_before_a_white_sky() {
+    /// What bending may cost in the mean.
+    const LOST: f32 = 0.08;
     let mut rng = Rng(32);
     let metal = |distribution, alpha| Bsdf::RoughConductor {
         distribution,
@@ -299,15 +302,73 @@ fn reliefs_before_a_white_sky() {
                     scene.quad(shape, [-9.0, -0.4, -9.0], [0.0, 0.0, 18.0], [18.0, 0.0, 0.0]);
                     frame([0.0, 0.0, -6.0], 12.0, [24, 24], 2)
                 };
-                let pixels: Vec<f32> = picture(&scene, &frame, 256).iter().map(|p| p[0]).collect();
-                let mean = pixels.iter().sum::<f32>() / pixels.len() as f32;
-                let (low, high) = pixels.iter().fold((f32::MAX, 0.0f32), |(l, h), &p| (l.min(p), h.max(p)));
-                println!("{name}, kind {kind}, ball {ball}: {mean:.3} from {low:.3} to {high:.3}");
-                assert!(
-                    mean < 1.005 && mean > 0.75 && high < 1.2 && low > 0.3,
-                    "{name}, kind {kind}, ball {ball}: {mean} {low} {high}"
-                );
+                let seen = |scene: &Scene| {
+                    let pixels: Vec<f32> = picture(scene, &frame, 256).iter().map(|p| p[0]).collect();
+                    let mean = pixels.iter().sum::<f32>() / pixels.len() as f32;
+                    let (low, high) = pixels.iter().fold((f32::MAX, 0.0f32), |(l, h), &p| (l.min(p), h.max(p)));
+                    [mean, low, high]
+                };
+                let bent = seen(&scene);
+                for detail in scene.materials.iter_mut().filter_map(|m| m.detail.as_mut()) {
+                    detail.relief = None;
+                }
+                let even = seen(&scene);
+                println!("{name}, kind {kind}, ball {ball}: mean, least, most {bent:.3?}; without relief {even:.3?}");
+                let [mean, low, high] = bent;
+                let told = format!("{name}, kind {kind}, ball {ball}: {bent:?}, without relief {even:?}");
+                assert!(mean < 1.005 && high < 1.2 && mean > even[0] - LOST && low > 0.15, "{told}");
             }
+        }
+    }
+}
+
+/// A wall whose normal is turned by a constant map, under a white sky: the integral of the turned cosine, times what the shadowing function leaves, over the
+/// hemisphere of the wall. Mitsuba 3.9.1 (scalar_rgb) renders 0.95932 and 0.86090 of the two that are shadowed, with a standard error of 0.0005.
+#[test]
+fn turned_normals_are_shadowed() {
+    for (normal, shadowed, mitsuba) in [
+        ([0.3, 0.0, 1.0], true, Some(0.95932)),
+        ([0.6, 0.2, 1.0], true, Some(0.86090)),
+        ([0.3, 0.0, 1.0], false, None),
+        ([0.6, 0.2, 1.0], false, None),
+    ] {
+        let mut scene = Scene { environment: Some([1.0; 3]), ..Scene::default() };
+        let [x, y, z] = normal;
+        let length = f64::sqrt(x * x + y * y + z * z);
+        let texel = normal.map(|v| ((v / length * 0.5 + 0.5) * 255.0).round() as u8);
+        let texture = scene.image([1, 1], texel.to_vec());
+        // as the byte has it
+        let m = texel.map(|b| f64::from(b) / 255.0 * 2.0 - 1.0);
+        let length = f64::sqrt(m[0] * m[0] + m[1] * m[1] + m[2] * m[2]);
+        let m = m.map(|v| v / length);
+        let alpha2 = ((1.0 - m[2] * m[2]) / (m[2] * m[2]) / 8.0).min(1.0) * f64::from(u8::from(shadowed));
+        let (steps, mut exact) = (800, 0.0);
+        for i in 0..steps {
+            let z = (f64::from(i) + 0.5) / f64::from(steps);
+            let r = f64::sqrt(1.0 - z * z);
+            let left = 2.0 / (1.0 + f64::sqrt(1.0 + alpha2 * (1.0 - z * z) / (z * z)));
+            for j in 0..steps {
+                let phi = f64::from(j) / f64::from(steps) * std::f64::consts::TAU;
+                let (sin, cos) = (libm::sin(phi), libm::cos(phi));
+                exact += (m[0] * r * cos + m[1] * r * sin + m[2] * z).max(0.0) * left;
+            }
+        }
+        exact *= 2.0 / f64::from(steps * steps);
+        let white = Bsdf::Diffuse { reflectance: [1.0; 3] };
+        // the general way of shading, too
+        let coated = Bsdf::Phong { diffuse: [1.0; 3], specular: [0.0; 3], exponent: 1.0 };
+        for bsdf in [white, coated] {
+            let relief = Some(Relief { kind: ReliefKind::Normals, texture, mirrored: true, shadowed });
+            let material = scene.detailed(bsdf, Detail { relief, ..Detail::default() });
+            scene.primitives.clear();
+            scene.normals.clear();
+            let shape = scene.shape(material, None);
+            scene.quad(shape, [-9.0, -9.0, 0.0], [18.0, 0.0, 0.0], [0.0, 18.0, 0.0]);
+            let found = mean_of(&scene, &frame_back([0.3, 0.2, 4.0], 10.0, [8, 8], 2), 4096);
+            println!("{normal:?} shadowed {shadowed}: {found:.5}, exact {exact:.5}, Mitsuba {mitsuba:?}");
+            assert!((found - exact).abs() < 0.001, "{normal:?} {shadowed}: {found} instead of {exact}");
+            // beside the noise of theirs, that of a normal in bytes
+            assert!(mitsuba.is_none_or(|theirs: f64| (found - theirs).abs() < 0.004), "{found} {mitsuba:?}");
         }
     }
 }

@@ -189,6 +189,11 @@ impl Converter<'_> {
                 ReliefKind::Bump(scale)
             }
         };
+        // Mitsuba 3's; what 0.5 and 0.6 had no word for is shaded as it shades it
+        let shadowed = self.boolean(id, "use_shadowing_function")?.unwrap_or(true);
+        if self.boolean(id, "flip_invalid_normals")? == Some(false) {
+            self.note(place, "flip_invalid_normals: a normal that the ray would see from behind is flipped, as by default, not black");
+        }
         let mut found = None;
         for property in &object.properties {
             if let Some(map) = self.document.object(property)?
@@ -213,7 +218,7 @@ impl Converter<'_> {
             self.unsupported(&property.place, "mesh_attribute as a bumpmap", "no relief");
             return Ok(inner);
         }
-        let relief = Relief { kind, texture, mirrored: false };
+        let relief = Relief { kind, texture, mirrored: false, shadowed };
         if self.has(&inner, &|d| d.relief.is_some()) {
             self.unsupported(place, format!("{plugin} around another relief"), "the inner relief");
             return Ok(inner);

@@ -150,7 +150,7 @@ fn masks_reliefs_and_two_sides() {
         format!("<bsdf type=\"bumpmap\">{}<float name=\"scale\" value=\"2\"/>{inside}</bsdf>", bitmap("map", ""))
     };
     let two = |inside: &str| format!("<bsdf type=\"twosided\">{inside}</bsdf>");
-    let relief = |mirrored| Some(Relief { kind: ReliefKind::Bump(2.0), texture: 0, mirrored });
+    let relief = |mirrored| Some(Relief { kind: ReliefKind::Bump(2.0), texture: 0, mirrored, shadowed: true });
     assert_eq!(detail(&scene(&shape(&bump(&two(grey)))).materials[0]).relief, relief(false));
     assert_eq!(detail(&scene(&shape(&two(&bump(grey)))).materials[0]).relief, relief(true));
     let normals = format!(

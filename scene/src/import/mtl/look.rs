@@ -139,12 +139,13 @@ impl Libraries<'_> {
                         );
                         self.note(&s.place, text);
                     }
-                    said.relief = Some(Relief { kind: ReliefKind::Bump(bump), texture, mirrored: true });
+                    said.relief =
+                        Some(Relief { kind: ReliefKind::Bump(bump), texture, mirrored: true, shadowed: true });
                 }
             }
             "norm" | "map_norm" => {
                 if let Some((texture, ..)) = self.texture(s, true)? {
-                    said.relief = Some(Relief { kind: ReliefKind::Normals, texture, mirrored: true });
+                    said.relief = Some(Relief { kind: ReliefKind::Normals, texture, mirrored: true, shadowed: true });
                 }
             }
             // of a light that is everywhere, and of other programs' ways to render

@@ -100,7 +100,7 @@ fn maps_take_the_place_of_numbers() {
     assert_eq!(detail("d 0.25").opacity, Amount::Constant(0.25));
     assert_eq!(detail("Tr 0.25").opacity, Amount::Constant(0.75));
     assert_eq!(detail("map_d g.png").opacity, Amount::Texture(0));
-    let relief = |kind| Some(Relief { kind, texture: 0, mirrored: true });
+    let relief = |kind| Some(Relief { kind, texture: 0, mirrored: true, shadowed: true });
     assert_eq!(detail("map_Bump -bm 0.5 g.png").relief, relief(ReliefKind::Bump(0.5)));
     assert_eq!(detail("norm g.png").relief, relief(ReliefKind::Normals));
     let raw = |out: &Description| matches!(out.textures[0].kind, TextureKind::Image { raw: true, .. });
