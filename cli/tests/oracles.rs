@@ -1,4 +1,4 @@
-//! Small scenes, one for each material, emitter, sensor and shape, against Mitsuba 3's pictures of them.
+//! Small scenes, one for each material, emitter, sensor, shape and most of what they have beside their kind, against Mitsuba 3's pictures of them.
 //!
 //! `oracles/` holds both; `tests/accuracy/run oracles` makes them. What is rendered here is the same on every machine, so a test that passed once fails by a
 //! change of ours only. Its samples are few: it finds a wrong model, not a wrong digit, which is for `tests/accuracy/run` to find.
@@ -115,7 +115,7 @@ fn small_scenes_are_mitsubas() {
         .filter(|path| path.extension().is_some_and(|e| e == "xml"))
         .collect();
     scenes.sort();
-    assert!(scenes.len() >= 30, "{} scenes", scenes.len());
+    assert!(scenes.len() >= 60, "{} scenes", scenes.len());
     let wrong: Vec<String> = scenes.iter().filter_map(|xml| compare(folder.path(), xml).err()).collect();
     assert!(wrong.is_empty(), "{} of {} differ:\n{}", wrong.len(), scenes.len(), wrong.join("\n"));
 }
