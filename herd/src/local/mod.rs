@@ -13,6 +13,8 @@ mod film;
 pub mod journal;
 pub mod nodes;
 pub mod owner;
+#[cfg(test)]
+mod poisoned;
 mod run;
 #[cfg(test)]
 mod skipping;

@@ -36,8 +36,9 @@ fn key() -> impl Strategy<Value = PathKey> {
 }
 
 fn float() -> impl Strategy<Value = f32> {
-    prop_oneof![-10f32..10.0, Just(0.0), Just(-0.0), Just(f32::INFINITY), any::<f32>()]
-        .prop_map(|x| if x.is_nan() { 1.0 } else { x })
+    // NaN too, with and without its sign and its payload: who reads a group sees what was written
+    let nan = prop_oneof![Just(f32::NAN), Just(-f32::NAN), Just(f32::from_bits(0x7f80_0001))];
+    prop_oneof![-10f32..10.0, Just(0.0), Just(-0.0), Just(f32::INFINITY), any::<f32>(), nan]
 }
 
 fn triple() -> impl Strategy<Value = [f32; 3]> {
@@ -86,7 +87,10 @@ fn flights() -> impl Strategy<Value = Flights> {
 
 /// The plain twin: one after the other, field by field, sorted as text.
 fn plain(rays: &Flights) -> Vec<String> {
-    let paths = rays.paths.iter().map(|f| format!("{:?} {:?}", bytemuck::bytes_of(&f.ray), (f.candidate, f.visit)));
+    let paths = rays
+        .paths
+        .iter()
+        .map(|f| format!("{:?} {} {:?}", bytemuck::bytes_of(&f.ray), f.candidate.t.to_bits(), (f.candidate, f.visit)));
     let shadows = rays.shadows.iter().map(|f| format!("{:?} {:?}", bytemuck::bytes_of(&f.ray), f.visit));
     let mut all: Vec<String> = paths.chain(shadows).collect();
     all.sort();
