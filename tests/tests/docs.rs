@@ -60,3 +60,40 @@ fn each_alert_says_what_to_do() {
         assert!(alerts.contains(&section), "there is no alert {section}");
     }
 }
+
+/// Sources that a document names, as `file.rs` or `file.rs: test`.
+fn named_tests(text: &str) -> Vec<(String, Option<String>)> {
+    let spans = text.split('`').skip(1).step_by(2).filter(|s| !s.contains([' ', '\n']) || s.contains(".rs: "));
+    let files = spans.filter_map(|s| match s.split_once(": ") {
+        Some((file, test)) => Some((file, Some(test.to_owned()))),
+        None => s.ends_with(".rs").then_some((s, None)),
+    });
+    files.map(|(file, test)| (file.to_owned(), test)).collect()
+}
+
+#[test]
+fn each_test_that_the_numbers_stand_on_is_there() {
+    assert_eq!(
+        named_tests("`a/b.rs: c_d`, `x::y`, `e.rs`\n`--f g`"),
+        [("a/b.rs".to_owned(), Some("c_d".to_owned())), ("e.rs".to_owned(), None)]
+    );
+    let top = top();
+    let document = read(&top.join("docs/numerics.md"));
+    let named = named_tests(&document);
+    assert!(named.iter().filter(|(_, test)| test.is_some()).count() > 25, "{named:?}: has the form changed?");
+    for (file, test) in named {
+        let text = read(&top.join(&file));
+        if let Some(test) = test {
+            let at = text.find(&format!("fn {test}("));
+            let at = at.unwrap_or_else(|| panic!("{file} has no {test}, which docs/numerics.md names"));
+            // its attribute stands right before it, or before it in a macro
+            assert!(text[..at].trim_end().ends_with("#[test]"), "{test} of {file} is no test");
+        }
+    }
+    // every row of the first table ends with one at least
+    let first = document.split("\n## ").next().unwrap_or_default();
+    for row in first.lines().filter(|l| l.starts_with("| ") && !l.starts_with("| where")) {
+        let last = row.trim_end_matches(" |").rsplit(" | ").next().unwrap_or_default();
+        assert!(named_tests(last).iter().any(|(_, test)| test.is_some()), "no test in {row}");
+    }
+}
