@@ -90,7 +90,7 @@ impl SerializedReader {
 
     /// Whether mesh number `index` of a file has colours, and the bytes read to know.
     pub fn has_colors(path: &Path, index: u32) -> Result<(bool, u64), ImportError> {
-        let mut file = Source::open(path)?;
+        let mut file = Source::open_head(path)?;
         let (at, _) = find(&mut file, index)?;
         let mut source = file.into_zlib(at + 4)?;
         let flags = u32_of(&mut source)?;

@@ -36,7 +36,10 @@ impl StlReader {
     /// Opens a file. It is text if it begins with `solid` and its first bytes are text, and is not exactly as long as its binary
     /// count says (binary files that begin with `solid` exist).
     pub fn open(path: &Path, options: &StreamOptions) -> Result<Self, ImportError> {
-        let mut source = Source::open(path)?;
+        StlReader::of(Source::open(path)?, options)
+    }
+
+    fn of(mut source: Source, options: &StreamOptions) -> Result<Self, ImportError> {
         let length = source.length();
         let head = source.peek(1024)?;
         let count = head.get(80..84).map(|b| u64::from(u32::from_le_bytes([b[0], b[1], b[2], b[3]])));
@@ -69,14 +72,16 @@ impl StlReader {
     /// Whether a file has colours, as far as its head and its first triangle tell, and the bytes read for it. Two programs have put them into
     /// the 16 bits that the format leaves free, one of them with `COLOR=` in the head.
     pub fn has_colors(path: &Path) -> Result<(bool, u64), ImportError> {
-        let reader = StlReader::open(path, &StreamOptions::default())?;
-        let Format::Binary { count } = reader.format else { return Ok((false, reader.source.bytes_read())) };
         let mut source = Source::open_head(path)?;
-        let head = source.peek(HEAD as usize + TRIANGLE)?;
+        let head = source.peek(HEAD as usize + TRIANGLE)?.to_vec();
+        let reader = StlReader::of(source, &StreamOptions::default())?;
         let said = head.get(..80).is_some_and(|text| text.windows(6).any(|w| w == b"COLOR="));
         let word = head.get(HEAD as usize + TRIANGLE - 2..).unwrap_or_default();
-        let colored = count > 0 && (said || word.iter().any(|b| *b != 0));
-        Ok((colored, reader.source.bytes_read() + source.bytes_read()))
+        let colored = match reader.format {
+            Format::Binary { count } => count > 0 && (said || word.iter().any(|b| *b != 0)),
+            Format::Ascii { .. } => false,
+        };
+        Ok((colored, reader.source.bytes_read()))
     }
 
     fn next_binary(&mut self) -> Result<[[f64; 3]; 3], ImportError> {
