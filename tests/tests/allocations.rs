@@ -2,14 +2,13 @@
 
 #![allow(unsafe_code)]
 
+mod example;
+
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::cell::Cell;
-use std::path::Path;
-use std::sync::Arc;
 
-use rayherd_api::{ImageSize, RenderJobSpec};
 use rayherd_herd::flight::{Flights, PathFlight, ShadowFlight};
-use rayherd_herd::job::{JobError, PreparedScene, spec};
+use rayherd_herd::job::{JobError, PreparedScene};
 use rayherd_herd::profile::Clock;
 use rayherd_herd::resident::{Resident, ResidentSurfaces};
 use rayherd_herd::task::camera::tiles;
@@ -17,9 +16,8 @@ use rayherd_herd::task::{CameraFeed, Loop, Outbox, Shading, Stop};
 use rayherd_herd::wave::CameraUnit;
 use rayherd_render::bvh::Kernel;
 use rayherd_render::film::BoundedFilm;
-use rayherd_scene::import::{DescriptionSource, StreamOptions, import};
-use rayherd_scene::objects::MemoryObjects;
-use rayherd_scene::prepare::{Cut, NoProgress, PrepareSettings, SpoolSettings, prepare};
+use rayherd_render::frame::Frame;
+use rayherd_scene::prepare::{Cut, PrepareSettings};
 
 /// What one thread allocated: how often, how much it holds, the most that it held.
 #[derive(Clone, Copy, Default)]
@@ -101,40 +99,32 @@ impl Outbox for Away {
 /// A scene whose tasks hold everything, or its first split of several.
 struct Case {
     scene: PreparedScene,
-    job: RenderJobSpec,
+    frame: Frame,
     resident: Resident,
 }
 
 impl Case {
     fn new(example: &str, splits: u32, held: usize) -> Self {
-        let mut job = RenderJobSpec::default();
-        job.image.size = Some(ImageSize::new(64, 64).unwrap());
-        job.sampling.max_depth = Some(8);
-        let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../examples").join(example);
-        let description = import(&path, &spec::import_options(&job)).unwrap();
-        let source = DescriptionSource::new(&description, StreamOptions::default());
-        let objects = Arc::new(MemoryObjects::default());
         let settings = PrepareSettings { cut: Cut::Splits(splits), ..PrepareSettings::default() };
-        let made = prepare(&description, &source, &settings, &SpoolSettings::default(), objects.as_ref(), &NoProgress);
-        let scene = PreparedScene::open(made.unwrap().manifest, objects).unwrap();
+        let (scene, frame) = example::prepared(example, 64, 8, &settings);
         let set: Vec<u32> = scene.grid.owning().iter().take(held).collect();
         let resident = Resident::load(&scene, &set, &scene).unwrap();
-        Case { scene, job, resident }
+        Case { scene, frame, resident }
     }
 
     /// What a loop over so many samples a pixel allocates, and its batches.
     fn counted(&self, samples: u32) -> (Counts, u64) {
-        let frame = spec::frame(&self.job, &self.scene.manifest, None).unwrap();
+        let frame = &self.frame;
         let surfaces = Ready(self.resident.surfaces(&self.scene, &self.scene).unwrap());
         let skips = self.scene.skips();
-        let units = (0..tiles(&frame)).map(|tile| CameraUnit { tile, first: 0, end: samples }).collect();
+        let units = (0..tiles(frame)).map(|tile| CameraUnit { tile, first: 0, end: samples }).collect();
         let stop = Batches(Cell::new(0));
         let before = COUNTS.get();
         COUNTS.set(Counts { peak: before.held, ..before });
-        let mut camera = CameraFeed::new(&frame, units, skips);
+        let mut camera = CameraFeed::new(frame, units, skips);
         let mut film = BoundedFilm::new(frame.layout(), usize::MAX);
         let mut trace = Loop::new(Kernel::Auto, 2048, skips, Clock::new(false)).unwrap();
-        let (context, mut flights) = (self.scene.context(&frame), Flights::default());
+        let (context, mut flights) = (self.scene.context(frame), Flights::default());
         if self.resident.is_complete() {
             trace
                 .run_complete(&context, &self.resident, &surfaces, &mut flights, &mut camera, &mut film, &stop)

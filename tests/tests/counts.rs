@@ -3,36 +3,23 @@
 //!
 //! Bounds stand a little above what was counted when they were set; whoever lowers a count lowers its bound.
 
-use std::path::Path;
-use std::sync::Arc;
+mod example;
 
-use rayherd_api::{ImageSize, RenderJobSpec, Strategy};
-use rayherd_herd::job::{JobSettings, NodeSpec, PreparedScene, Sampling, Silent, spec};
+use rayherd_api::Strategy;
+use rayherd_herd::job::{JobSettings, NodeSpec, Sampling, Silent};
 use rayherd_herd::local::render_local;
 use rayherd_herd::report::Report;
 use rayherd_render::bvh::{Forest, Kernel, Serial, Tracer, build_block};
 use rayherd_render::ray::{Hit, Ray};
-use rayherd_scene::import::{DescriptionSource, StreamOptions, import};
-use rayherd_scene::objects::MemoryObjects;
-use rayherd_scene::prepare::{Cut, NoProgress, PrepareSettings, SpoolSettings, prepare};
+use rayherd_scene::prepare::{Cut, PrepareSettings};
 
 const SIZE: u32 = 64;
 const SPP: u32 = 16;
 
 /// The report of an example, cut into so many splits, on nodes of one slot that hold a part of the scene each.
 fn report(example: &str, splits: u32, nodes: usize, part: Option<f64>, strategy: Strategy) -> Report {
-    let mut job = RenderJobSpec::default();
-    job.image.size = Some(ImageSize::new(SIZE, SIZE).unwrap());
-    job.sampling.max_depth = Some(8);
-    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../examples").join(example);
-    let description = import(&path, &spec::import_options(&job)).unwrap();
-    let source = DescriptionSource::new(&description, StreamOptions::default());
-    let objects = Arc::new(MemoryObjects::default());
     let settings = PrepareSettings { cut: Cut::Splits(splits), ..PrepareSettings::default() };
-    let made =
-        prepare(&description, &source, &settings, &SpoolSettings::default(), objects.as_ref(), &NoProgress).unwrap();
-    let scene = PreparedScene::open(made.manifest, objects).unwrap();
-    let frame = spec::frame(&job, &scene.manifest, None).unwrap();
+    let (scene, frame) = example::prepared(example, SIZE, 8, &settings);
     let bytes: u64 = (0..scene.splits()).map(|s| scene.split_bytes(s)).sum();
     let settings = JobSettings {
         strategy,

@@ -3,16 +3,12 @@
 //!
 //! `RAYHERD_STOP_SEEDS=1000` for those of the document.
 
-use std::path::Path;
-use std::sync::Arc;
+mod example;
 
-use rayherd_api::{ImageSize, RenderJobSpec};
-use rayherd_herd::job::{JobSettings, PreparedScene, Sampling, Silent, spec};
+use rayherd_herd::job::{JobSettings, PreparedScene, Sampling, Silent};
 use rayherd_herd::local::{JobOutcome, render_local};
 use rayherd_render::frame::Frame;
-use rayherd_scene::import::{DescriptionSource, StreamOptions, import};
-use rayherd_scene::objects::MemoryObjects;
-use rayherd_scene::prepare::{NoProgress, PrepareSettings, SpoolSettings, prepare};
+use rayherd_scene::prepare::PrepareSettings;
 
 const SIZE: u32 = 12;
 /// Most samples, and those of the pictures to compare with.
@@ -27,21 +23,6 @@ fn seeds() -> u64 {
         Ok(text) => text.parse().unwrap_or_else(|_| panic!("RAYHERD_STOP_SEEDS is {text:?}: give a number of seeds")),
         Err(_) => 50,
     }
-}
-
-fn cornell() -> (PreparedScene, Frame) {
-    let mut job = RenderJobSpec::default();
-    job.image.size = Some(ImageSize::new(SIZE, SIZE).unwrap());
-    job.sampling.max_depth = Some(6);
-    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../examples/cornell-box.xml");
-    let description = import(&path, &spec::import_options(&job)).unwrap();
-    let source = DescriptionSource::new(&description, StreamOptions::default());
-    let objects = Arc::new(MemoryObjects::default());
-    let (settings, spool) = (PrepareSettings::default(), SpoolSettings::default());
-    let made = prepare(&description, &source, &settings, &spool, objects.as_ref(), &NoProgress).unwrap();
-    let scene = PreparedScene::open(made.manifest, objects).unwrap();
-    let frame = spec::frame(&job, &scene.manifest, None).unwrap();
-    (scene, frame)
 }
 
 fn render(scene: &PreparedScene, frame: &Frame, seed: u64, target: Option<f64>) -> JobOutcome {
@@ -70,7 +51,7 @@ fn rel_mse(picture: &[f64], truth: &[f64]) -> f64 {
 
 #[test]
 fn what_stopping_at_a_target_leaves() {
-    let (scene, frame) = cornell();
+    let (scene, frame) = example::prepared("cornell-box.xml", SIZE, 6, &PrepareSettings::default());
     let seeds = seeds();
     let fixed: Vec<Vec<f64>> = (0..seeds).map(|seed| pixels(&render(&scene, &frame, seed, None))).collect();
     let mut truth = vec![0.0; fixed[0].len()];
