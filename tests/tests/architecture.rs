@@ -241,8 +241,9 @@ fn the_operator_reads_no_rays_and_no_film() {
         .chain(sources("herd/src/remote"))
         .chain(sources("herd/src/driver"))
         .collect();
-    let of_workers =
-        |p: &str| p.ends_with("remote/station.rs") || p.ends_with("remote/tests.rs") || p.ends_with("remote/bands.rs");
+    let of_workers = |p: &str| {
+        ["remote/station/", "remote/tests.rs", "remote/tests/", "remote/bands.rs"].iter().any(|own| p.contains(own))
+    };
     let files: Vec<_> = files.into_iter().filter(|(p, _)| !of_workers(p)).collect();
     assert_eq!(offending(&files, &words), Vec::<String>::new());
 }

@@ -1,14 +1,15 @@
 //! The operator's side of preparing: one worker cuts the source into splits, all of them build the blocks.
 //!
 //! What the first one packed lies below the job's own prefix, on the stores where the blocks are to lie, until the scene has its name. A worker
-//! that goes takes no more with it than the few splits that it had in hand. A scene that is small, or that is prepared for one worker, is
-//! prepared by one.
+//! that goes takes no more with it than the few splits that it had in hand, and an operator that goes no more than the blocks that were built:
+//! the next one finds the draft. A scene that is small, or that is prepared for one worker, is prepared by one.
 
 use std::sync::Arc;
 
 use rayherd_scene::manifest::Manifest;
 use rayherd_scene::objects::{ObjectRef, ObjectStore};
 use rayherd_scene::prepare::complete;
+use serde::{Deserialize, Serialize};
 
 use super::blocks::{by_name, key, lost};
 use super::frames::{Job, Keeper};
@@ -76,19 +77,30 @@ fn by_workers(
             if let Some(reference) = name.and_then(|name| listing::find(job, replicas, name)) {
                 return Ok((reference, true, 0));
             }
-            let draft = match job.fleet.call_while_staffed(work.clone())? {
-                Some(Done::Prepared { scene, reused, cells_passed }) => {
-                    return Ok((scene, reused, cells_passed));
-                }
-                Some(Done::Drafted { draft, cells_passed }) => Begun::open(job, replicas, &prefix, draft, cells_passed),
-                Some(_) => return Err(JobError::Internal("a worker reports something else than it was to do".into())),
-                None => {
-                    tracing::warn!("the worker that was to prepare the scene is gone: others come first");
-                    continue;
-                }
+            // once: what was found and cannot be built of is cut anew
+            let left = name.filter(|_| cuts == 0).and_then(|name| Cut::find(job, &prefix, name));
+            let cut = match left {
+                Some(cut) => cut,
+                None => match job.fleet.call_while_staffed(work.clone())? {
+                    Some(Done::Prepared { scene, reused, cells_passed }) => {
+                        return Ok((scene, reused, cells_passed));
+                    }
+                    Some(Done::Drafted { draft, cells_passed }) => {
+                        let cut = Cut { of: name.map(str::to_owned), draft, cells_passed };
+                        cut.keep(job, replicas, &prefix);
+                        cut
+                    }
+                    Some(_) => {
+                        return Err(JobError::Internal("a worker reports something else than it was to do".into()));
+                    }
+                    None => {
+                        tracing::warn!("the worker that was to prepare the scene is gone: others come first");
+                        continue;
+                    }
+                },
             };
             cuts += 1;
-            begun = match draft {
+            begun = match Begun::open(job, replicas, &prefix, &cut) {
                 Ok(draft) => {
                     keeper.cut(&draft.bytes(job.depot.len()));
                     Some(draft)
@@ -114,6 +126,45 @@ fn again(e: JobError, cuts: u32) -> Result<Option<Begun>, JobError> {
     Ok(None)
 }
 
+/// Where the draft of a scene lies, for whoever goes on with its job.
+#[derive(Serialize, Deserialize)]
+struct Cut {
+    /// The name of the source as it was listed ([`Listing::name`]): of another one, or of one without a name, it is no draft.
+    of: Option<String>,
+    draft: ObjectRef,
+    cells_passed: u64,
+}
+
+impl Cut {
+    fn key(prefix: &str) -> String {
+        format!("{prefix}/cut")
+    }
+
+    /// Without it the next operator has the scene cut again.
+    fn keep(&self, job: &Job, replicas: u32, prefix: &str) {
+        if self.of.is_none() {
+            return;
+        }
+        let kept = serde_json::to_vec(self).map_err(|e| JobError::Internal(e.to_string())).and_then(|body| {
+            let store = job.depot.replicated(replicas)?;
+            Ok(job.runtime.block_on(store.put(&Cut::key(prefix), body.into()))?)
+        });
+        if let Err(e) = kept {
+            tracing::warn!("where the draft of the scene lies is not kept: {e}");
+        }
+    }
+
+    fn find(job: &Job, prefix: &str, name: &str) -> Option<Self> {
+        // one copy: this must not make more of what goes soon
+        let body = job.depot.replicated(1).and_then(|store| job.runtime.block_on(store.get(&Cut::key(prefix))));
+        let body = body.inspect_err(|e| tracing::debug!("no draft of the scene: {e}")).ok()?;
+        let cut: Cut = serde_json::from_slice(&body)
+            .inspect_err(|e| tracing::warn!("{} cannot be read, the scene is cut again: {e}", Cut::key(prefix)))
+            .ok()?;
+        (cut.of.as_deref() == Some(name)).then_some(cut)
+    }
+}
+
 /// A scene that is cut and whose blocks are not all built.
 struct Begun {
     draft: PreparedScene,
@@ -124,13 +175,13 @@ struct Begun {
 }
 
 impl Begun {
-    fn open(job: &Job, replicas: u32, prefix: &str, draft: ObjectRef, cells_passed: u64) -> Result<Self, JobError> {
+    fn open(job: &Job, replicas: u32, prefix: &str, cut: &Cut) -> Result<Self, JobError> {
         let store = job.depot.view(1, Some(by_name()), None)?;
-        let body = job.runtime.block_on(store.get(&key(prefix, &draft))).map_err(lost)?;
+        let body = job.runtime.block_on(store.get(&key(prefix, &cut.draft))).map_err(lost)?;
         let draft = PreparedScene::open(Manifest::decode(&body)?, objects(job, replicas)?)?;
         let places = Homes::of(&draft, job.depot.len(), replicas).splits().to_vec();
         let blocks = vec![None; places.len()];
-        Ok(Begun { draft, places, blocks, cells_passed })
+        Ok(Begun { draft, places, blocks, cells_passed: cut.cells_passed })
     }
 
     /// Bytes of blocks by store, as far as they are known.

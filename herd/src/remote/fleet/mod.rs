@@ -102,18 +102,8 @@ impl Fleet {
         let state = self.lock();
         let ready = state.workers.iter().flatten().filter(|w| w.seen.elapsed() < SILENCE).count() as u32;
         let ready_work: usize = state.workers.iter().flatten().map(|w| w.ready.len()).sum();
-        Tally {
-            ready,
-            bytes: state.bytes.clone(),
-            cpu: state.cpu,
-            cache_failures: state.cache_failures,
-            hops: state.hops,
-            outcomes: state.outcomes.clone(),
-            by_worker: state.by_worker.clone(),
-            queued: (state.common.len() + ready_work) as u64,
-            running: state.doing.len() as u64,
-            first_attempt: state.first_attempt,
-        }
+        let queued = (state.common.len() + ready_work) as u64;
+        Tally { ready, queued, running: state.doing.len() as u64, ..state.tally.clone() }
     }
     /// How many of the splits and of the texture tiles nobody has read since the stage began, of so many.
     pub fn never_read(&self, all: [usize; 2]) -> [u64; 2] {
@@ -242,7 +232,7 @@ impl Fleet {
             && let Some((task, number, work, stop)) =
                 state.workers[poll.worker.number as usize].as_mut().and_then(|w| w.ready.pop_front())
         {
-            state.first_attempt.get_or_insert_with(Instant::now);
+            state.tally.first_attempt.get_or_insert_with(Instant::now);
             (What::Attempt { task, number, stop }, work)
         } else if poll.clerk
             && poll.previews
@@ -272,13 +262,13 @@ impl Fleet {
         let Some(doing) = state.doing.remove(&report.id) else { return Ok(false) };
         let mut bytes = Bytes::default();
         report.bytes.iter().for_each(|r| bytes.add(r.stage, r.op, r.kind, r.place, r.bytes));
-        state.bytes.merge(&bytes);
-        state.cpu += report.cpu;
-        state.cache_failures += report.cache_failures;
+        state.tally.bytes.merge(&bytes);
+        state.tally.cpu += report.cpu;
+        state.tally.cache_failures += report.cache_failures;
         if !matches!(report.result, Err(Failure::Stopped)) {
             state.deaths.came_out(report.worker.number, &doing.held.keys);
         }
-        let of_worker = state.by_worker.entry(report.worker.number).or_default();
+        let of_worker = state.tally.by_worker.entry(report.worker.number).or_default();
         of_worker.cpu += report.cpu;
         of_worker.resident = report.resident;
         // by the name that the stage had before memory was taken away
@@ -290,10 +280,13 @@ impl Fleet {
             }
         }
         match (doing.what, report.result) {
-            (What::Attempt { task, number, .. }, result) => {
-                *state.outcomes.entry(Outcome::of(&result)).or_default() += 1;
+            (What::Attempt { task, number, stop }, result) => {
+                // once another attempt has done the task, what it read is deleted, and whoever reads it still finds it gone
+                let superfluous = stop.is_set() && result.is_err();
+                let outcome = if superfluous { Outcome::Stopped } else { Outcome::of(&result) };
+                *state.tally.outcomes.entry(outcome).or_default() += 1;
                 if let Ok(Done::Made { hops, .. }) = &result {
-                    state.hops += hops;
+                    state.tally.hops += hops;
                 }
                 let result = state.judge(result);
                 state.finished.push_back(Finished { task, number, result, cpu: report.cpu, bytes });

@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 use super::super::deaths::{Deaths, Held, MOST_DEATHS};
 use super::super::message::{Beat, Done, Failure, Holds, Poll, Stage, Work, WorkerId};
 use super::preview::Preview;
-use super::{MOST_FAILURES, Outcome, PATIENCE, SILENCE, Unknown, WorkerTally};
+use super::{MOST_FAILURES, Outcome, PATIENCE, SILENCE, Tally, Unknown};
 use crate::driver::Finished;
 use crate::job::JobError;
 use crate::ledger::TaskId;
@@ -41,15 +41,10 @@ pub struct State {
     /// Since the last success.
     pub failures: u32,
     pub failing: Option<Instant>,
-    pub bytes: Bytes,
-    pub cpu: f64,
-    pub cache_failures: u64,
-    pub hops: u64,
-    pub outcomes: BTreeMap<Outcome, u64>,
-    pub by_worker: BTreeMap<u32, WorkerTally>,
+    /// What is added up; what is there now is counted by [`super::Fleet::tally`].
+    pub tally: Tally,
     /// Splits and texture tiles that somebody has read in this stage.
     pub read: [BTreeSet<u32>; 2],
-    pub first_attempt: Option<Instant>,
     pub preview: Preview,
     pub over: bool,
     /// Another fleet has the workers now.
@@ -196,7 +191,7 @@ impl State {
     /// A worker is gone: what it did is lost, what it had not begun goes back, what any worker can do is done by another. Whether it was there.
     pub fn leave(&mut self, number: u32) -> bool {
         let Some(worker) = self.workers.get_mut(number as usize).and_then(Option::take) else { return false };
-        if let Some(tally) = self.by_worker.get_mut(&number) {
+        if let Some(tally) = self.tally.by_worker.get_mut(&number) {
             tally.resident = 0;
         }
         self.emptied.insert(number);
@@ -237,7 +232,7 @@ impl State {
 
     /// An attempt that was begun is gone with the work in it.
     fn lose(&mut self, task: TaskId, number: u32) {
-        *self.outcomes.entry(Outcome::Gone).or_default() += 1;
+        *self.tally.outcomes.entry(Outcome::Gone).or_default() += 1;
         self.give_back(task, number);
     }
 

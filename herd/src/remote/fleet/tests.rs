@@ -128,3 +128,72 @@ fn work_whose_answer_was_lost_on_its_way_is_given_out_again() {
         assert_eq!(call.join().unwrap().unwrap(), done);
     });
 }
+
+#[test]
+fn a_worker_that_comes_back_under_another_session_loses_only_its_tasks() {
+    let fleet = Fleet::new(1, "e");
+    let poll = |session: &str| poll(0, session);
+    assert_eq!(fleet.answer(&poll("a")), Ok(Answer::Wait));
+    assert!(fleet.answer(&crate::remote::tests::poll(1, "a")).is_err());
+    std::thread::scope(|scope| {
+        let work = Work::Merge { name: None, parts: vec![], spp: 1, picture: None, band: None };
+        let call = scope.spawn(|| fleet.call(work));
+        let handed = |session: &str| {
+            let since = Instant::now();
+            loop {
+                match fleet.answer(&poll(session)).unwrap() {
+                    Answer::Work { id, .. } => return id,
+                    _ => assert!(since.elapsed() < Duration::from_secs(60)),
+                }
+                std::thread::sleep(Duration::from_millis(1));
+            }
+        };
+        let first = handed("a");
+        let second = handed("b");
+        assert_ne!(first, second);
+        let report = |session: &str, id: &str, rel_mse| Report {
+            worker: WorkerId { number: 0, session: session.into() },
+            id: id.into(),
+            result: Ok(Done::Merged { film: None, rel_mse, error: None, non_finite: vec![], picture: vec![] }),
+            cpu: 0.5,
+            bytes: vec![],
+            reads: Default::default(),
+            holds: None,
+            cache_failures: 0,
+            resident: 5,
+        };
+        assert_eq!(fleet.report(report("b", &first, Some(1.0))), Ok(false), "its id is known no more");
+        assert_eq!(fleet.report(report("b", "other-0", Some(2.0))), Ok(false));
+        let beat = Beat { worker: poll("b").worker, running: vec![first.clone(), second.clone()] };
+        assert_eq!(fleet.beat(&beat), Ok(vec![first]));
+        assert_eq!((fleet.tally().running, fleet.tally().queued), (1, 0));
+        assert_eq!(fleet.report(report("b", &second, Some(3.0))), Ok(true));
+        assert_eq!(fleet.report(report("b", &second, Some(4.0))), Ok(false), "a replay");
+        let tally = fleet.tally();
+        assert_eq!(tally.by_worker.get(&0), Some(&WorkerTally { cpu: 0.5, resident: 5 }), "counted once");
+        assert_eq!((tally.cpu, tally.running, tally.queued), (0.5, 0, 0));
+        let done = call.join().unwrap().unwrap();
+        assert!(matches!(done, Done::Merged { rel_mse: Some(x), .. } if x == 3.0));
+    });
+    assert_eq!(fleet.tally().outcomes, Default::default(), "there was no attempt");
+    // the loop over rounds learns that the one that came back holds nothing
+    let told = fleet.next(Duration::ZERO).unwrap();
+    assert!(matches!(told, Some(Event::MemoryLost(0))) && fleet.next(Duration::ZERO).unwrap().is_none());
+}
+
+#[test]
+fn workers_that_wait_are_sent_to_the_next_fleet_at_once() {
+    let runtime = tokio::runtime::Runtime::new().unwrap();
+    let fleet = Fleet::new(1, "e");
+    let poll = poll(0, "a");
+    // far longer than a test may take
+    let waits = runtime.block_on(async {
+        let waiting = fleet.poll(&poll, Duration::from_secs(3600));
+        let retire = async {
+            tokio::time::sleep(Duration::from_millis(20)).await;
+            fleet.retire();
+        };
+        futures::future::join(waiting, retire).await.0
+    });
+    assert_eq!(waits, Ok(Answer::Wait));
+}

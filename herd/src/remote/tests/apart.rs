@@ -185,6 +185,77 @@ fn workers_that_die_cost_what_they_had_in_hand() {
     }
 }
 
+/// An operator goes while blocks are built: the next one has them built of the same draft, if it is of the same source and all there.
+#[test]
+fn an_operator_that_comes_after_the_cut_has_nothing_cut_again() {
+    let spec = spec(Strategy::SchedulingGridOverlapReduced, 8, 2);
+    for (what, cuts) in [("nothing", 1), ("a split", 2), ("the draft", 2), ("the source", 2)] {
+        let (cluster, kept) = (Cluster { apart: 2, ..Cluster::new(3) }, Arc::new(Kept::default()));
+        let mut cut = 0;
+        for epoch in ["e1", "e2"] {
+            let (fleet, depot) = (Fleet::new(3, epoch), cluster.depot(None));
+            let wire = cluster.wire(&fleet);
+            let gate = Gate { wire: &wire, handed: Mutex::default(), closed: (epoch == "e1").into() };
+            std::thread::scope(|scope| {
+                for number in 0..3 {
+                    let station = gate.station(&cluster, number, epoch);
+                    scope.spawn(move || station.run());
+                }
+                let keeper: Arc<dyn Keeper> = kept.clone();
+                let (spec, depot, fleet, cluster) = (&spec, &depot, &fleet, &cluster);
+                let job = scope.spawn(move || {
+                    let result = run(&cluster.job(spec, depot, fleet, epoch), &keeper, &Silent);
+                    fleet.end();
+                    result
+                });
+                if epoch == "e1" {
+                    wait_for(|| gate.count(is_build) > 0);
+                    fleet.cancel("stopped by the test");
+                    gate.closed.store(false, Ordering::Relaxed);
+                    assert!(matches!(job.join().unwrap(), Err(JobError::Owned(_))));
+                } else {
+                    job.join().unwrap().unwrap();
+                }
+            });
+            cut += gate.count(is_cut);
+            if epoch == "e2" {
+                break;
+            }
+            let lies = cluster.runtime.block_on(cluster.stores[0].list("jobs/1/prepare/")).unwrap();
+            assert!(lies.iter().any(|(key, _)| key == "jobs/1/prepare/cut"), "{lies:?}");
+            let packed = gate.handed.lock().unwrap().iter().find_map(|w| match w {
+                Work::Build { splits, .. } => Some(splits[0].packed),
+                _ => None,
+            });
+            let gone = match what {
+                "a split" => format!("jobs/1/prepare/{}", packed.unwrap().hash),
+                "the draft" => {
+                    let cut = cluster.runtime.block_on(cluster.stores[0].get("jobs/1/prepare/cut")).unwrap();
+                    let cut: serde_json::Value = serde_json::from_slice(&cut).unwrap();
+                    let draft: ObjectRef = serde_json::from_value(cut["draft"].clone()).unwrap();
+                    format!("jobs/1/prepare/{}", draft.hash)
+                }
+                "the source" => {
+                    let mut other = wall();
+                    *other.last_mut().unwrap() ^= 1;
+                    cluster.runtime.block_on(cluster.stores[0].put(TEXTURE, other.into())).unwrap();
+                    continue;
+                }
+                _ => continue,
+            };
+            for store in &cluster.stores {
+                cluster.runtime.block_on(store.delete(std::slice::from_ref(&gone))).unwrap();
+            }
+        }
+        assert_eq!(cut, cuts, "{what}");
+        // of another source the first tiles lie there still
+        if what != "the source" {
+            check(&cluster, &spec, &kept, 2);
+            assert!(cluster.picture(0) == expected(&spec), "{what}");
+        }
+    }
+}
+
 #[test]
 fn a_scene_for_one_worker_and_a_small_one_are_prepared_by_one() {
     let spec = spec(Strategy::Auto, 6, 1);

@@ -225,9 +225,11 @@ fn what_a_worker_has_cached_makes_it_a_holder_and_is_read_from_s3_no_more() {
         assert_eq!(holders(), [[0; 0]; 4]);
         begin("fourth", true);
         will_hold([&[0, 1], &[0], &[1], &[1]]);
-        // a worker that is gone holds nothing
-        fleet.gone(&WorkerId { number: 1, session: "s".into() });
-        assert_eq!(holders()[..3], [vec![0], vec![0], vec![]]);
+        // a worker that is gone holds nothing, until it asks for work again, which it does at once
+        wait_for(|| {
+            fleet.gone(&WorkerId { number: 1, session: "s".into() });
+            holders()[..3] == [vec![0], vec![0], vec![]]
+        });
     });
 }
 

@@ -1,0 +1,131 @@
+//! Workers of earlier versions, and what they have begun.
+
+use super::*;
+
+/// A job that a version without bands has begun, whose film is stored as a whole, goes on by bands; and what it stores of its film does not
+/// pile up.
+#[test]
+fn a_film_that_was_stored_in_other_parts_goes_on() {
+    let mut spec = spec(Strategy::SchedulingGridOverlapReduced, 4, 2);
+    spec.task_seconds = Some(0.003);
+    let want = expected(&spec);
+    let layout = Layout { size: [48, 40], aovs: Aovs::ALL };
+    assert_eq!([1, 8, 11, BAND].map(|band| bands::tiles(band, layout)), [1, 2, 3, 139]);
+    for (first, then, tiles) in [(BAND, 1, 1), (BAND, 11, 3), (BAND, BAND, 139)] {
+        let (cluster, kept) = (Cluster { band: first, ..Cluster::new(3) }, Arc::new(Kept::default()));
+        begun(&cluster, &spec, &kept, 30);
+        let cluster = Cluster { band: then, ..cluster };
+        if let Err(e) = cluster.render(&spec, &kept) {
+            panic!("{first} {then}: {e}");
+        }
+        assert!(cluster.picture(1) == want, "{first} {then}");
+        let reports = kept.reports.lock().unwrap();
+        assert!(reports[0].tasks_reused > 0 && reports[0].tasks_redone == 0, "{:?}", reports[0]);
+        let part = cluster.depot(None).part("jobs/1/0", 2).unwrap();
+        let records = cluster.runtime.block_on(journal::read(&part)).unwrap();
+        let bands: BTreeSet<Option<u32>> = records
+            .values()
+            .max_by_key(|r| r.sequence)
+            .and_then(|r| Some(r.snapshot.as_ref()?.film.iter().map(|f| f.band).collect()))
+            .expect("a job ends with a snapshot");
+        let all = (0..4u32.div_ceil(tiles)).map(|b| (tiles < 4).then_some(b)).collect();
+        assert_eq!(bands, all);
+        // parts that were added up are deleted, all but those of the last snapshots and of the last state without rays on their way
+        for store in &cluster.stores {
+            let lie = cluster.runtime.block_on(store.list("jobs/1/0/film/")).unwrap().len() as u64;
+            println!("{first} {then}: {lie} film objects, {} tasks", reports[0].tasks);
+            assert!(lie * 3 < reports[0].tasks, "{lie} of {}", reports[0].tasks);
+        }
+    }
+}
+
+/// Workers of a version without bands would add the whole of a part to each band: as long as one is there, films are added up whole, and
+/// it gets nothing else.
+#[test]
+fn a_worker_that_knows_no_bands_is_given_none() {
+    let fleet = Fleet::new(2, "e");
+    let poll = |number: u32, bands: bool| {
+        let text = serde_json::to_value(Poll { bands, ..poll(number, "a") }).unwrap();
+        // as it is written where the word is not known
+        let serde_json::Value::Object(mut map) = text else { unreachable!() };
+        if !bands {
+            map.remove("bands");
+        }
+        serde_json::from_value::<Poll>(map.into()).unwrap()
+    };
+    assert!(fleet.knows_bands());
+    let merge = |band| super::super::Work::Merge { name: None, parts: vec![], spp: 1, picture: None, band };
+    let given = |number, bands| match fleet.answer(&poll(number, bands)).unwrap() {
+        Answer::Work { work, .. } => Some(*work),
+        _ => None,
+    };
+    std::thread::scope(|scope| {
+        let call = scope.spawn(|| fleet.call_all(vec![merge(Some(0)), merge(None)]));
+        let old = std::cell::OnceCell::new();
+        wait_for(|| given(0, false).is_some_and(|work| old.set(work).is_ok()));
+        assert_eq!(old.get(), Some(&merge(None)));
+        assert!(!fleet.knows_bands());
+        assert_eq!((given(0, false), given(1, true)), (None, Some(merge(Some(0)))));
+        fleet.cancel("enough");
+        assert!(matches!(call.join().unwrap(), Err(JobError::Owned(_))));
+    });
+}
+
+/// A worker of a version without AOVs, as its polls are written where the word is not known.
+struct Old<'a>(&'a Wire<'a>, Mutex<Vec<super::super::Work>>);
+
+impl Link for Old<'_> {
+    fn poll(&self, poll: &Poll) -> Result<Answer, LinkError> {
+        let mut written = serde_json::to_value(poll).unwrap();
+        assert!(written.as_object_mut().unwrap().remove("aovs").is_some());
+        let answer = self.0.poll(&serde_json::from_value(written).unwrap())?;
+        if let Answer::Work { work, .. } = &answer {
+            self.1.lock().unwrap().push((**work).clone());
+        }
+        Ok(answer)
+    }
+    fn report(&self, report: &Report) -> Result<(), LinkError> {
+        self.0.report(report)
+    }
+    fn beat(&self, beat: &Beat) -> Result<Vec<String>, LinkError> {
+        self.0.beat(beat)
+    }
+}
+
+/// It would leave the layers out without a word: of a job that asks for some it gets nothing, of another one its share.
+#[test]
+fn a_worker_that_knows_no_layers_works_only_for_jobs_without() {
+    for layers in [true, false] {
+        let mut spec = spec(Strategy::SchedulingGridOverlapReduced, 4, 2);
+        spec.image.aovs = spec.image.aovs.filter(|_| layers);
+        let (cluster, kept) = (Cluster { band: 1, ..Cluster::new(3) }, Arc::new(Kept::default()));
+        let (fleet, depot) = (Fleet::new(3, "e"), cluster.depot(None));
+        let wire = cluster.wire(&fleet);
+        let old = Old(&wire, Mutex::default());
+        std::thread::scope(|scope| {
+            let aside = Station::new(
+                &old,
+                cluster.depot(Some(0)),
+                1,
+                WorkerId { number: 0, session: "s".into() },
+                cluster.scratch.path().to_owned(),
+            );
+            scope.spawn(move || aside.unwrap().run().unwrap());
+            for number in 1..3 {
+                let station = cluster.station(&wire, number, "s", Some(number));
+                scope.spawn(move || station.run().unwrap());
+            }
+            let keeper: Arc<dyn Keeper> = kept.clone();
+            let result = run(&cluster.job(&spec, &depot, &fleet, "e"), &keeper, &Silent);
+            assert_eq!(fleet.unfit(), if layers { vec![0] } else { vec![] });
+            assert_eq!(fleet.is_up(0), !layers);
+            fleet.end();
+            result.unwrap();
+        });
+        assert!(cluster.picture(1) == expected(&spec), "layers: {layers}");
+        let works = old.1.into_inner().unwrap();
+        // a scene is the same with and without
+        let of_stage = works.iter().filter(|w| !matches!(w, super::super::Work::Prepare { .. })).count();
+        assert_eq!(of_stage == 0, layers, "{works:?}");
+    }
+}
