@@ -97,6 +97,9 @@ pub struct LedgerPointer {
     pub record: String,
 }
 
+/// Most characters of a condition's message: room for some dozens of problems, each with its place.
+pub const MOST_MESSAGE: usize = 4096;
+
 impl RenderJobObject {
     /// The job as a local run reads it from a file.
     pub fn job(&self) -> RenderJob {
@@ -114,6 +117,8 @@ impl RenderJobObject {
 pub fn definition() -> Result<CustomResourceDefinition, serde_json::Error> {
     let mut crd = serde_json::to_value(RenderJobObject::crd())?;
     let schema = &mut crd["spec"]["versions"][0]["schema"]["openAPIV3Schema"];
+    schema["properties"]["status"]["properties"]["conditions"]["items"]["properties"]["message"]["maxLength"] =
+        json!(MOST_MESSAGE);
     tidy(schema);
     schema["description"] =
         json!("One scene, rendered from one or more cameras by worker pods beside the storage that holds it.");

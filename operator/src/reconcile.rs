@@ -39,6 +39,8 @@ use crate::watching::Watching;
 const MANAGER: &str = "rayherd-operator";
 /// Objects of a job that Kubernetes does not know of: those in the storage.
 pub const FINALIZER: &str = "rayherd.io/storage";
+/// Most bytes of an event's note that the API server takes.
+const MOST_NOTE: usize = 1024;
 /// Between two looks at a job that runs.
 const LOOK: Duration = Duration::from_secs(1);
 /// Before it is looked again whether a job that was stopped has stopped.
@@ -638,7 +640,7 @@ async fn tell(
         let event = Event {
             type_: if bad { EventType::Warning } else { EventType::Normal },
             reason: if condition.type_ == "Prepared" { "Prepared".into() } else { condition.reason.clone() },
-            note: Some(condition.message.chars().take(1000).collect()),
+            note: Some(condition.message[..condition.message.floor_char_boundary(MOST_NOTE)].to_owned()),
             action: condition.type_.clone(),
             secondary: None,
         };

@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::{Condition, MicroTime, Time};
 use k8s_openapi::jiff::{SignedDuration, Timestamp};
-use rayherd_api::resource::{RenderJobObject, RenderJobStatus};
+use rayherd_api::resource::{MOST_MESSAGE, RenderJobObject, RenderJobStatus};
 use rayherd_herd::job::spec::scene_settings;
 use rayherd_herd::remote::fleet::Tally;
 use rayherd_herd::report::{Kind, Op, Place};
@@ -235,8 +235,8 @@ fn set(
     message: &str,
     now: Timestamp,
 ) {
-    // what Kubernetes takes at most
-    let message: String = message.chars().take(4000).collect();
+    // a longer one would be refused, and with it all of the status
+    let message: String = message.chars().take(MOST_MESSAGE).collect();
     let found = status.conditions.iter_mut().find(|c| c.type_ == kind);
     let since = found.as_ref().filter(|c| c.status == value).map(|c| c.last_transition_time.clone());
     let condition = Condition {
@@ -382,6 +382,17 @@ mod tests {
         // told twice, counted once
         let again = of(&job(serde_json::to_value(&third).unwrap()), &state, &local, 1, true, at(2));
         assert_eq!(again, third);
+    }
+
+    /// One character more than the schema lets through, and the API server would take none of the status.
+    #[test]
+    fn a_message_is_cut_to_what_the_schema_takes() {
+        let crd = serde_json::to_value(rayherd_api::resource::definition().unwrap()).unwrap();
+        let schema = &crd["spec"]["versions"][0]["schema"]["openAPIV3Schema"]["properties"]["status"];
+        let most = &schema["properties"]["conditions"]["items"]["properties"]["message"]["maxLength"];
+        let told = refused(&job(json!({})), "Invalid", &"ö".repeat(100_000), true, at(0));
+        let failed = told.conditions.iter().find(|c| c.type_ == "Failed").unwrap();
+        assert_eq!(Some(failed.message.chars().count() as u64), most.as_u64());
     }
 
     #[test]
