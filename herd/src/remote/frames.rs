@@ -11,7 +11,7 @@ use tokio::runtime::Handle;
 
 use super::bands;
 use super::guard::Guard;
-use super::homes::Homes;
+use super::homes::{Homes, bytes_read};
 use super::message::Stage;
 use super::parts::Parts;
 use super::preparing::prepared;
@@ -144,11 +144,7 @@ fn frames(job: &Job, keeper: &Arc<dyn Keeper>, progress: &dyn Progress) -> Resul
     let scene = PreparedScene::open(Manifest::load(objects.as_ref(), &reference)?, objects)?;
     let homes = Homes::of(&scene, job.depot.len(), replicas);
     let places = homes.splits();
-    let mut bytes = vec![0; job.depot.len() as usize];
-    for (split, on) in places.iter().enumerate() {
-        on.iter().for_each(|&n| bytes[n as usize] += scene.split_bytes(split as u32));
-    }
-    keeper.placed(&bytes);
+    keeper.placed(&bytes_read(&scene, places, job.depot.len(), |split| scene.split_bytes(split)));
     let sampling = Sampling {
         spp: from_spec::samples(spec, &scene.manifest),
         target_error: spec.sampling.target_error,

@@ -66,6 +66,16 @@ impl Homes {
     }
 }
 
+/// Bytes by store of the blocks that lie so, each of a size that its split's number gives: those of splits that own no cell are not counted, since nobody
+/// reads them, and nobody's place is to be chosen by them.
+pub fn bytes_read(scene: &PreparedScene, places: &[Vec<u32>], stores: u32, size: impl Fn(u32) -> u64) -> Vec<u64> {
+    let mut bytes = vec![0; stores as usize];
+    for split in scene.owning_order() {
+        places[split as usize].iter().for_each(|&n| bytes[n as usize] += size(split));
+    }
+    bytes
+}
+
 /// All stores, these first.
 fn ranked(scene: &PreparedScene, stores: u32, first: &[u32]) -> Vec<u32> {
     let others = place::ranked(&scene.manifest.content.0, stores).into_iter().filter(|n| !first.contains(n));
@@ -105,6 +115,23 @@ mod tests {
         for n in 0..40 {
             let on: BTreeSet<u32> = two.tile(n).into_iter().collect();
             assert!(on.len() == 2 && on.iter().all(|&s| s < 6), "{n}: {on:?}");
+        }
+    }
+
+    /// Of the blocks that nobody reads there may be more than of the others: they draw no worker to where they lie.
+    #[test]
+    fn workers_are_drawn_to_homes_by_what_is_read() {
+        let mut scene = prepared(&cornell(), 24, true);
+        let order = scene.owning_order();
+        assert!((order.len() as u32) < scene.splits(), "some splits own no cell");
+        for here in 0..6 {
+            scene.manifest.homes = Homes::chosen(&scene, 6, 2, Some(here));
+            let homes = scene.manifest.homes.clone().unwrap();
+            let bytes = bytes_read(&scene, Homes::of(&scene, 6, 2).splits(), 6, |s| scene.split_bytes(s));
+            assert_eq!(bytes.iter().sum::<u64>(), 2 * order.iter().map(|&s| scene.split_bytes(s)).sum::<u64>());
+            let least = homes.iter().map(|&h| bytes[h as usize]).min().unwrap();
+            let others = (0..6u32).filter(|n| !homes.contains(n)).map(|n| bytes[n as usize]).max().unwrap();
+            assert!(least > others, "{homes:?} {bytes:?}");
         }
     }
 

@@ -13,7 +13,7 @@ use serde::{Deserialize, Serialize};
 
 use super::blocks::{by_name, key, lost};
 use super::frames::{Job, Keeper};
-use super::homes::Homes;
+use super::homes::{Homes, bytes_read};
 use super::listing::{self, Listing};
 use super::message::{Apart, Done, ToBuild, Work};
 use crate::job::{JobError, PreparedScene};
@@ -184,13 +184,9 @@ impl Begun {
         Ok(Begun { draft, places, blocks, cells_passed: cut.cells_passed })
     }
 
-    /// Bytes of blocks by store, as far as they are known.
+    /// Bytes of blocks that will be read, by store, as far as they are known.
     fn bytes(&self, stores: u32) -> Vec<u64> {
-        let mut bytes = vec![0; stores as usize];
-        for (split, on) in self.draft.manifest.splits.iter().zip(&self.places) {
-            on.iter().for_each(|&n| bytes[n as usize] += split.weight());
-        }
-        bytes
+        bytes_read(&self.draft, &self.places, stores, |split| self.draft.manifest.splits[split as usize].weight())
     }
 
     /// What is left to do, in pieces of about equal bytes. Those of one home are together, so that a worker beside it reads and writes there.
