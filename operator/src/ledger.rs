@@ -15,6 +15,8 @@ use rayherd_scene::objects::ObjectHash;
 use serde_json::json;
 use tokio::runtime::Handle;
 
+use crate::backoff::part;
+
 /// Field manager of the pointers.
 const MANAGER: &str = "rayherd-ledger";
 /// Tries, when others write other parts of the status at the same time or the API server does not answer.
@@ -189,7 +191,7 @@ impl Ledger {
                 }
                 Err(e) => {
                     tracing::warn!("{e}");
-                    let wait = std::time::Duration::from_millis(100 << attempt.min(5));
+                    let wait = part(std::time::Duration::from_millis(100 << attempt.min(5)), &self.name, attempt);
                     tokio::time::sleep(wait).await;
                 }
             }

@@ -423,6 +423,12 @@ async fn keep_pods(
     for kill in killed {
         running.fleet.killed_for_memory(kill.number, kill.limit.as_deref());
     }
+    // a session begins with its pod's name; one that is ending may still give back what it does
+    let there: BTreeSet<(u32, String)> =
+        found.iter().filter(|p| !is_over(p)).filter_map(|p| Some((build::number(p)?, p.name_any()))).collect();
+    running.fleet.only(|number, session| {
+        session.rsplit_once('-').is_none_or(|(pod, _)| there.contains(&(number, pod.to_owned())))
+    });
     let (lies, placed, waits) = {
         let state = running.lock();
         // a known scene is looked up at once: workers of an earlier run must not go for that moment
@@ -580,6 +586,12 @@ async fn try_pod(job: &RenderJobObject, context: &Context, namespace: &str, stor
     }
 }
 
+/// Whether nothing of a pod runs any more.
+fn is_over(pod: &Pod) -> bool {
+    let phase = pod.status.as_ref().and_then(|s| s.phase.as_deref());
+    matches!(phase, Some("Succeeded" | "Failed"))
+}
+
 async fn list_pods(pods: &Api<Pod>, uid: &str) -> Result<Vec<Pod>, Error> {
     let params = ListParams::default().labels(&format!("{}={uid}", build::LABEL));
     Ok(pods.list(&params).await.map_err(api("list the workers' pods"))?.items)
@@ -605,11 +617,9 @@ async fn remove_pods(job: &RenderJobObject, context: &Context, namespace: &str, 
 }
 
 fn may_write(pod: &Pod, now: Timestamp) -> bool {
-    let phase = pod.status.as_ref().and_then(|s| s.phase.as_deref());
-    let ended = matches!(phase, Some("Succeeded" | "Failed"));
     // the time that a deleted pod carries is the end of its grace period
     let silent = pod.metadata.deletion_timestamp.as_ref().is_some_and(|Time(t)| now.duration_since(*t) > SILENT);
-    !ended && !silent
+    !is_over(pod) && !silent
 }
 
 /// Writes the status, if it says something new.

@@ -1,4 +1,5 @@
-//! Prepared scenes that no job names, and that none has used for long, go: the leader looks at long intervals.
+//! Prepared scenes that no job names, and that none has used for long, go, and objects that belong to no scene, as a preparing that was killed leaves
+//! them: the leader looks at long intervals. Such an object goes when it is found so twice.
 //!
 //! Looked at is each storage that a job names or has used since this operator began to lead: it has no keys to others. The API server is asked
 //! for the jobs, and told nothing.
@@ -12,7 +13,7 @@ use kube::api::{ApiResource, DynamicObject, ListParams};
 use rayherd_api::StorageSpec;
 use rayherd_api::resource::RenderJobObject;
 use rayherd_herd::remote::{Depot, Storage};
-use rayherd_herd::scenes::{Rules, Swept, sweep, unix_now};
+use rayherd_herd::scenes::{Rules, Swept, collect_again, sweep, unix_now};
 use rayherd_scene::objects::ObjectHash;
 use serde_json::Value;
 
@@ -29,10 +30,18 @@ const DAY: u64 = 86_400;
 
 /// Storages that jobs have used.
 #[derive(Default)]
-pub struct Storages(Mutex<Vec<(Storage, Depot)>>);
+pub struct Storages(Mutex<Vec<Known>>);
+
+#[derive(Clone)]
+struct Known {
+    storage: Storage,
+    depot: Depot,
+    /// What belonged to no scene when it was looked last.
+    strays: BTreeSet<ObjectHash>,
+}
 
 impl Storages {
-    fn lock(&self) -> MutexGuard<'_, Vec<(Storage, Depot)>> {
+    fn lock(&self) -> MutexGuard<'_, Vec<Known>> {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
@@ -43,8 +52,16 @@ impl Storages {
             (&other.bucket, &other.prefix) == (&storage.bucket, &storage.prefix) && servers(other) == servers(storage)
         };
         let mut all = self.lock();
-        all.retain(|(other, _)| !same(other));
-        all.push((storage.clone(), depot.clone()));
+        let strays =
+            all.iter_mut().find(|k| same(&k.storage)).map(|k| std::mem::take(&mut k.strays)).unwrap_or_default();
+        all.retain(|k| !same(&k.storage));
+        all.push(Known { storage: storage.clone(), depot: depot.clone(), strays });
+    }
+
+    fn found(&self, storage: &Storage, strays: BTreeSet<ObjectHash>) {
+        if let Some(known) = self.lock().iter_mut().find(|k| k.storage == *storage) {
+            known.strays = strays;
+        }
     }
 }
 
@@ -102,7 +119,7 @@ pub async fn look(context: &Context, now: u64) -> Swept {
     }
     let keep = Duration::from_secs(u64::from(context.config.scene_days) * DAY);
     let known = context.storages.lock().clone();
-    for (_, depot) in known {
+    for Known { storage, depot, strays } in known {
         let rules = Rules { now, keep, used: &used };
         match sweep(depot.stores(), &rules, || context.turns.alone()).await {
             Ok(gone) => {
@@ -116,6 +133,20 @@ pub async fn look(context: &Context, now: u64) -> Swept {
                 swept.bytes += gone.bytes;
             }
             Err(e) => tracing::warn!("scenes that nobody uses stay for now: {e}"),
+        }
+        // nor while a job looks for its scene, or has it prepared: what is made for it has no name yet
+        let Some(_alone) = context.turns.alone() else { continue };
+        match collect_again(depot.stores(), &strays).await {
+            Ok((gone, left)) => {
+                if gone.objects > 0 {
+                    let (objects, bytes) = (gone.objects, gone.bytes);
+                    tracing::info!(objects, bytes, "objects that belong to no scene are deleted");
+                }
+                swept.objects += gone.objects;
+                swept.bytes += gone.bytes;
+                context.storages.found(&storage, left);
+            }
+            Err(e) => tracing::warn!("objects that belong to no scene stay for now: {e}"),
         }
     }
     swept
@@ -206,5 +237,40 @@ mod tests {
             drop(look_of_job);
             assert_eq!(swept.scenes, gone, "{status} {looking}");
         }
+    }
+
+    /// What a preparing that was killed has left: not the first time, when somebody may be at it, nor while a job looks.
+    #[tokio::test]
+    async fn what_belongs_to_no_scene_goes_when_it_is_found_so_twice() {
+        let (context, server) = context();
+        let (store, depot) = storage(&[], 0).await;
+        context.storages.add(&Storage::default(), &depot);
+        let stray = |body: &'static [u8]| {
+            let store = store.clone();
+            async move {
+                let key = object_key(&ObjectRef::of(body).hash);
+                store.put(&key, Bytes::from_static(body)).await.unwrap();
+            }
+        };
+        let left = || async { store.list("objects/").await.unwrap().len() };
+        let none = json!({"apiVersion": "rayherd.io/v1alpha1", "kind": "RenderJobList", "metadata": {}, "items": []});
+        let turns = context.turns.clone();
+        let looks = async {
+            stray(b"1").await;
+            look(&context, NOW).await;
+            assert_eq!(left().await, 1);
+            let of_job = turns.look(|| Ok(())).unwrap();
+            look(&context, NOW).await;
+            assert_eq!(left().await, 1);
+            drop(of_job);
+            stray(b"22").await;
+            // with newer keys it is the same storage
+            context.storages.add(&Storage::default(), &depot);
+            let swept = look(&context, NOW).await;
+            assert_eq!((left().await, swept.objects, swept.bytes), (1, 1, 1));
+            assert_eq!(look(&context, NOW).await.objects, 1);
+        };
+        tokio::join!(looks, serve(server, (0..4).map(|_| step("GET", JOBS, 200, none.clone())).collect()));
+        assert_eq!(left().await, 0);
     }
 }

@@ -309,6 +309,11 @@ pub(super) fn poll(number: u32, session: &str) -> Poll {
     }
 }
 
+/// The pod of a worker is known to be gone.
+pub(super) fn gone(fleet: &Fleet, number: u32, session: &str) {
+    fleet.only(|n, s| (n, s) != (number, session));
+}
+
 fn wait_for(what: impl Fn() -> bool) {
     let since = Instant::now();
     while !what() {

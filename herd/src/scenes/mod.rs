@@ -180,6 +180,26 @@ fn is_unreadable(e: &JobError) -> bool {
 /// When a store does not answer, when a manifest cannot be read, on which it depends what may go, or when these are not all of the storage's
 /// stores; then nothing is deleted.
 pub async fn collect(stores: Stores<'_>) -> Result<Collected, JobError> {
+    Ok(collect_if(stores, |_| true).await?.0)
+}
+
+/// The same of those objects that belonged to no scene the last time either, `before`; and those that do not now, for the next time. So long after
+/// that nobody prepares any more what they were made for, or whoever did is dead.
+///
+/// # Errors
+/// As [`collect`].
+pub async fn collect_again(
+    stores: Stores<'_>,
+    before: &BTreeSet<ObjectHash>,
+) -> Result<(Collected, BTreeSet<ObjectHash>), JobError> {
+    collect_if(stores, |hash| before.contains(hash)).await
+}
+
+/// What was deleted of what belongs to no scene, and what was not.
+async fn collect_if(
+    stores: Stores<'_>,
+    may: impl Fn(&ObjectHash) -> bool,
+) -> Result<(Collected, BTreeSet<ObjectHash>), JobError> {
     let found = find(stores).await?;
     let mut known = found.stores;
     let mut kept = BTreeSet::new();
@@ -208,11 +228,15 @@ pub async fn collect(stores: Stores<'_>) -> Result<Collected, JobError> {
         )));
     }
     let mut done = Collected::default();
+    let mut left = BTreeSet::new();
     let mut garbage = vec![Vec::new(); stores.len()];
     for (store, garbage) in stores.iter().zip(&mut garbage) {
         for (key, bytes) in store.list("objects/").await? {
             // by its form a key of ours
             match promised_hash(&key).filter(|hash| object_key(hash) == key) {
+                Some(hash) if !kept.contains(&hash) && !may(&hash) => {
+                    left.insert(hash);
+                }
                 Some(hash) if !kept.contains(&hash) => {
                     (done.objects, done.bytes) = (done.objects + 1, done.bytes + bytes);
                     garbage.push(key);
@@ -224,5 +248,5 @@ pub async fn collect(stores: Stores<'_>) -> Result<Collected, JobError> {
     for (store, garbage) in stores.iter().zip(&garbage) {
         store.delete(garbage).await?;
     }
-    Ok(done)
+    Ok((done, left))
 }

@@ -16,7 +16,7 @@ use rayherd_api::ByteSize;
 use tokio::sync::Notify;
 
 use super::deaths::{Held, MOST_KILLED, Verdict, keys};
-use super::message::{Answer, Beat, Done, Failure, Holds, Poll, Report, Stage, Work, WorkerId};
+use super::message::{Answer, Beat, Done, Failure, Holds, Poll, Report, Stage, Work};
 use crate::driver::{Event, Executor, Finished, Launch};
 use crate::job::JobError;
 use crate::report::Bytes;
@@ -165,12 +165,17 @@ impl Fleet {
         self.tell();
     }
 
-    /// A pod is known to be gone: its work goes back at once. Another session's is left alone.
-    pub fn gone(&self, worker: &WorkerId) {
+    /// Workers whose pods are known to be gone: what they did goes back at once. `is_there` is told a worker's number and session.
+    pub fn only(&self, is_there: impl Fn(u32, &str) -> bool) {
         let mut state = self.lock();
-        let number = worker.number as usize;
-        if state.workers.get(number).and_then(|w| w.as_ref()).is_some_and(|w| w.session == worker.session) {
-            state.leave(worker.number);
+        let known = (0u32..).zip(&state.workers);
+        let gone: Vec<u32> =
+            known.filter(|(n, w)| w.as_ref().is_some_and(|w| !is_there(*n, &w.session))).map(|(n, _)| n).collect();
+        if !gone.is_empty() {
+            gone.into_iter().for_each(|number| {
+                tracing::warn!("the pod of worker {number} is gone: what it did is done again");
+                state.leave(number);
+            });
             self.tell();
         }
     }

@@ -7,7 +7,8 @@ use crate::ledger::TaskId;
 use crate::local::attempt::Attempt;
 use crate::local::slots::StopFlag;
 use crate::plan::Set;
-use crate::remote::tests::poll;
+use crate::remote::message::WorkerId;
+use crate::remote::tests::{gone, poll};
 
 fn report(worker: &WorkerId, id: &str, result: Result<Done, Failure>) -> Report {
     Report {
@@ -47,7 +48,7 @@ fn attempts_that_a_dead_worker_had_begun_are_lost_and_those_that_it_had_not_are_
     assert_eq!(begun.len(), 3);
     // one is given back in time
     assert_eq!(fleet.report(report(&poll.worker, &begun[1], Err(Failure::Stopped))), Ok(true));
-    fleet.gone(&poll.worker);
+    gone(&fleet, 0, "s");
     let mut back = Vec::new();
     while let Some(event) = fleet.next(Duration::ZERO).unwrap() {
         if let Event::Finished(finished) = event {
@@ -84,7 +85,7 @@ fn a_preview_is_made_by_a_clerk_at_most_once_and_keeps_nobody() {
                 let failed = Err(Failure::ForNow { message: "no".into() });
                 assert_eq!(fleet.report(report(&slot.worker, &id, failed)), Ok(true));
             }
-            "goes" => fleet.gone(&slot.worker),
+            "goes" => gone(&fleet, slot.worker.number, &slot.worker.session),
             _ => fleet.killed_for_memory(0, None),
         }
         assert_eq!(answer(&clerk), None, "{end}: it is not tried again");

@@ -33,7 +33,7 @@ use near::Near;
 
 /// Between two signs of life.
 const BEAT: Duration = Duration::from_secs(1);
-/// Before an operator that did not answer is asked again.
+/// Before an operator that did not answer is asked again, at most: all threads of all workers lose it at once, and are not to come back at once.
 const PAUSE: Duration = Duration::from_millis(500);
 /// After work that did not come out for now, before more is asked for: doubled for each such failure in a row, up to the longest.
 const FIRST_REST: Duration = Duration::from_millis(125);
@@ -76,6 +76,8 @@ pub struct Station<'l> {
     panicked: AtomicBool,
     /// Pieces of work in a row that did not come out for now.
     failures: AtomicU32,
+    /// How often an answer was waited for in vain.
+    pauses: AtomicU32,
 }
 
 /// Work that is being done.
@@ -113,7 +115,7 @@ impl<'l> Station<'l> {
         let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(1).enable_all().build();
         let runtime = runtime.map_err(|e| JobError::Internal(format!("no runtime for input and output: {e}")))?;
         let (running, leaving, panicked) = (Mutex::default(), AtomicBool::new(false), AtomicBool::new(false));
-        let failures = AtomicU32::new(0);
+        let (failures, pauses) = (AtomicU32::new(0), AtomicU32::new(0));
         let slots = slots.max(1);
         let copies = None;
         let (threads, traffic) = (RwLock::default(), Traffic::default());
@@ -131,6 +133,7 @@ impl<'l> Station<'l> {
             leaving,
             panicked,
             failures,
+            pauses,
         })
     }
 
@@ -252,7 +255,7 @@ impl<'l> Station<'l> {
                 Err(_) if self.is_leaving() => return Ok(Next::Over),
                 Err(e) if matches!(Failure::from(&e), Failure::ForNow { .. }) => {
                     tracing::warn!("{e}; trying again");
-                    std::thread::sleep(PAUSE);
+                    self.pause();
                 }
                 Err(e) => return Err(e),
             }
@@ -329,7 +332,7 @@ impl<'l> Station<'l> {
                 Ok(Answer::Over) => return Next::Over,
                 Err(e) => {
                     tracing::warn!("{e}");
-                    std::thread::sleep(PAUSE);
+                    self.pause();
                 }
             }
         }
@@ -379,7 +382,7 @@ impl<'l> Station<'l> {
             if since.elapsed() > PATIENCE || self.is_leaving() {
                 break;
             }
-            std::thread::sleep(PAUSE);
+            self.pause();
         }
         self.lock().remove(&id);
         // others may take it meanwhile
@@ -387,6 +390,15 @@ impl<'l> Station<'l> {
         while Instant::now() < end && !self.is_leaving() {
             std::thread::sleep(end.saturating_duration_since(Instant::now()).min(PAUSE));
         }
+    }
+
+    /// From half of [`PAUSE`] to all of it, each time and for each thread another part.
+    fn pause(&self) {
+        let number = self.pauses.fetch_add(1, Ordering::Relaxed);
+        let mut hasher = blake3::Hasher::new();
+        hasher.update(self.worker.session.as_bytes()).update(&number.to_le_bytes());
+        let part = f64::from(hasher.finalize().as_bytes()[0]) / 255.0;
+        std::thread::sleep(PAUSE.mul_f64(0.5 + 0.5 * part));
     }
 
     /// How long to wait before more work is asked for: what fails for now would fail again at once.

@@ -146,7 +146,7 @@ fn workers_that_die_cost_what_they_had_in_hand() {
             let over = || job.is_finished();
             let dies = |session: &str| {
                 let work = Hand(fleet, &over).takes(session).1;
-                fleet.gone(&WorkerId { number: 0, session: session.into() });
+                gone(fleet, 0, session);
                 work
             };
             assert!(is_cut(&dies("cuts")));
@@ -164,7 +164,7 @@ fn workers_that_die_cost_what_they_had_in_hand() {
             }
             // nobody is left; one that was only said to be gone might ask for work once more
             first.leave();
-            fleet.gone(&WorkerId { number: 1, session: "first".into() });
+            gone(fleet, 1, "first");
             gate.closed.store(false, Ordering::Relaxed);
             for number in 0..3 {
                 let station = gate.station(cluster, number, "last");
@@ -314,7 +314,7 @@ fn a_worker_that_knows_no_blocks_is_given_none_and_others_build_those_of_their_s
         // the calls are waited for in their order
         fleet.report(report).unwrap();
         let worker = WorkerId { number: 2, session: "a".into() };
-        fleet.gone(&worker);
+        gone(&fleet, 2, "a");
         let again = given(2, 0, true, false).unwrap();
         assert_eq!(again.0, build(0), "what it had in hand is done by another");
         let blocks = vec![ObjectRef::of(b"block")];
@@ -446,7 +446,7 @@ fn a_source_is_cut_beside_it_if_a_worker_is_there() {
         // beside none of these is anybody
         wait_for(|| given(0, 0));
         assert!(!given(0, 0), "the other one is beside it");
-        fleet.gone(&WorkerId { number: 1, session: "a".into() });
+        gone(&fleet, 1, "a");
         assert!(given(0, 0), "nobody is any more");
         fleet.cancel("enough");
         assert!(call.join().unwrap().is_err());

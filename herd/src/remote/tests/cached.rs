@@ -227,7 +227,7 @@ fn what_a_worker_has_cached_makes_it_a_holder_and_is_read_from_s3_no_more() {
         will_hold([&[0, 1], &[0], &[1], &[1]]);
         // a worker that is gone holds nothing, until it asks for work again, which it does at once
         wait_for(|| {
-            fleet.gone(&WorkerId { number: 1, session: "s".into() });
+            gone(&fleet, 1, "s");
             holders()[..3] == [vec![0], vec![0], vec![]]
         });
     });

@@ -69,9 +69,8 @@ fn a_job_without_workers_keeps_no_other_from_preparing_their_scene() {
         let waits = scope.spawn(move || run(&cluster.job(spec, depot, first, "f"), &keeper, &Silent));
         // nor one whose worker was there, and is gone with the work in its hands
         let poll = poll(0, "gone");
-        let gone = poll.worker.clone();
         wait_for(|| matches!(first.answer(&poll), Ok(Answer::Work { .. })));
-        first.gone(&gone);
+        gone(first, 0, "gone");
         cluster.render(spec, &kept).unwrap();
         first.cancel("enough");
         assert!(matches!(waits.join().unwrap(), Err(JobError::Owned(_))));
