@@ -433,6 +433,12 @@ def readme(write):
 def main():
     if sys.argv[3:] == ["write"]:
         return readme(True)
+    if sys.argv[3:4] == ["sets"]:
+        release, namespace = sys.argv[4:]
+        names = {MINIO["storage.default.service.name"]: f"{release}-minio", OWN: namespace}
+        for values, _ in SETS.values():
+            print(",".join(f"{path}={names.get(value, value)}" for path, value in values.items()))
+        return
     code, out, err = helm("lint", "--strict", CHART)
     assert code == 0 and "0 chart(s) failed" in out, f"helm lint: {out}{err}"
     for name, (values, check) in SETS.items():
