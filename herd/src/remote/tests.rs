@@ -89,6 +89,21 @@ impl Link for Wire<'_> {
     }
 }
 
+/// A wire that somebody asks for work in another way.
+struct Tap<'a, F>(Wire<'a>, F);
+
+impl<'a, F: Fn(&Wire<'a>, &Poll) -> Result<Answer, LinkError> + Send + Sync> Link for Tap<'a, F> {
+    fn poll(&self, poll: &Poll) -> Result<Answer, LinkError> {
+        (self.1)(&self.0, poll)
+    }
+    fn report(&self, report: &Report) -> Result<(), LinkError> {
+        self.0.report(report)
+    }
+    fn beat(&self, beat: &Beat) -> Result<Vec<String>, LinkError> {
+        self.0.beat(beat)
+    }
+}
+
 /// What etcd would keep.
 #[derive(Default)]
 struct Kept {

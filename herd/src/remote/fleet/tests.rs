@@ -198,3 +198,23 @@ fn workers_that_wait_are_sent_to_the_next_fleet_at_once() {
     });
     assert_eq!(waits, Ok(Answer::Wait));
 }
+
+/// Another attempt has done the task, and what this one read was deleted: no work is lost.
+#[test]
+fn an_attempt_that_was_beaten_and_finds_its_input_gone_is_none_that_is_lost() {
+    for (beaten, outcome) in [(false, Outcome::Lost), (true, Outcome::Stopped)] {
+        let fleet = Fleet::new(1, "e");
+        let poll = poll(0, "s");
+        assert_eq!(fleet.answer(&poll), Ok(Answer::Wait));
+        let attempt = Attempt { name: "a".into(), node: 0, set: Set::Reduce, groups: Vec::new(), camera: Vec::new() };
+        let stop = StopFlag::default();
+        fleet.launch(Launch { task: TaskId(0), number: 0, attempt, stop: stop.clone() });
+        let (id, _) = given(fleet.answer(&poll).unwrap()).unwrap();
+        if beaten {
+            stop.set();
+        }
+        let lost = Err(Failure::Lost { name: "g".into(), why: "gone".into() });
+        assert_eq!(fleet.report(report(&poll.worker, &id, lost)), Ok(true));
+        assert_eq!(fleet.tally().outcomes, BTreeMap::from([(outcome, 1)]));
+    }
+}

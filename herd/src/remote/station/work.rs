@@ -22,6 +22,8 @@ impl Station<'_> {
         let open = || open.map(|o| (o.stage, &o.shared)).ok_or_else(not_open);
         match work {
             Work::Prepare { spec, replicas, apart, .. } => {
+                // handed out to a worker that was told to leave meanwhile
+                stop.check()?;
                 prepare_scene(self.place(), spec, *replicas, apart.as_ref(), &self.scratch)
             }
             Work::Build { prefix, splits, replicas } => {

@@ -187,32 +187,21 @@ fn work_that_kills_its_worker_each_time_fails_the_job() {
     }
 }
 
-/// Lets a store hang once the scene is to be prepared.
-struct Stuck(&'static Wire<'static>, &'static Cluster, AtomicU32);
-
-impl Link for Stuck {
-    fn poll(&self, poll: &Poll) -> Result<Answer, LinkError> {
-        let answer = self.0.poll(poll)?;
-        if matches!(&answer, Answer::Work { work, .. } if matches!(**work, super::super::Work::Prepare { .. })) {
-            self.1.stores[0].hang(true);
-            self.2.fetch_add(1, Ordering::Relaxed);
-        }
-        Ok(answer)
-    }
-    fn report(&self, report: &Report) -> Result<(), LinkError> {
-        self.0.report(report)
-    }
-    fn beat(&self, beat: &Beat) -> Result<Vec<String>, LinkError> {
-        self.0.beat(beat)
-    }
-}
-
 #[test]
 fn a_worker_that_leaves_gives_back_the_scene_that_it_prepares_without_waiting_for_it() {
     // never freed: a thread waits for the store for ever
     let cluster: &Cluster = Box::leak(Box::new(Cluster::new(2)));
     let fleet: &Fleet = Box::leak(Box::new(Fleet::new(3, "e")));
-    let link: &Stuck = Box::leak(Box::new(Stuck(Box::leak(Box::new(cluster.wire(fleet))), cluster, AtomicU32::new(0))));
+    let handed: &AtomicU32 = Box::leak(Box::default());
+    // a store hangs once the scene is to be prepared
+    let link = Box::leak(Box::new(Tap(cluster.wire(fleet), |wire: &Wire, poll: &Poll| {
+        let answer = wire.poll(poll)?;
+        if matches!(&answer, Answer::Work { work, .. } if matches!(**work, super::super::Work::Prepare { .. })) {
+            cluster.stores[0].hang(true);
+            handed.fetch_add(1, Ordering::Relaxed);
+        }
+        Ok(answer)
+    })));
     let spec: &RenderJobSpec = Box::leak(Box::new(spec(Strategy::Auto, 4, 1)));
     let kept = Arc::new(Kept::default());
     let job = std::thread::spawn({
@@ -229,7 +218,7 @@ fn a_worker_that_leaves_gives_back_the_scene_that_it_prepares_without_waiting_fo
         move || first.run()
     });
     wait_for(|| cluster.stores[0].hung() > 0);
-    assert_eq!((link.2.load(Ordering::Relaxed), fleet.tally().running, first.is_idle()), (1, 1, false));
+    assert_eq!((handed.load(Ordering::Relaxed), fleet.tally().running, first.is_idle()), (1, 1, false));
     first.leave();
     wait_for(|| first.is_idle());
     assert_eq!((fleet.tally().running, fleet.tally().queued), (0, 1), "told, not found out by its silence");

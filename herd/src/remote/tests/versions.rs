@@ -71,27 +71,6 @@ fn a_worker_that_knows_no_bands_is_given_none() {
     });
 }
 
-/// A worker of a version without AOVs, as its polls are written where the word is not known.
-struct Old<'a>(&'a Wire<'a>, Mutex<Vec<super::super::Work>>);
-
-impl Link for Old<'_> {
-    fn poll(&self, poll: &Poll) -> Result<Answer, LinkError> {
-        let mut written = serde_json::to_value(poll).unwrap();
-        assert!(written.as_object_mut().unwrap().remove("aovs").is_some());
-        let answer = self.0.poll(&serde_json::from_value(written).unwrap())?;
-        if let Answer::Work { work, .. } = &answer {
-            self.1.lock().unwrap().push((**work).clone());
-        }
-        Ok(answer)
-    }
-    fn report(&self, report: &Report) -> Result<(), LinkError> {
-        self.0.report(report)
-    }
-    fn beat(&self, beat: &Beat) -> Result<Vec<String>, LinkError> {
-        self.0.beat(beat)
-    }
-}
-
 /// It would leave the layers out without a word: of a job that asks for some it gets nothing, of another one its share.
 #[test]
 fn a_worker_that_knows_no_layers_works_only_for_jobs_without() {
@@ -101,7 +80,17 @@ fn a_worker_that_knows_no_layers_works_only_for_jobs_without() {
         let (cluster, kept) = (Cluster { band: 1, ..Cluster::new(3) }, Arc::new(Kept::default()));
         let (fleet, depot) = (Fleet::new(3, "e"), cluster.depot(None));
         let wire = cluster.wire(&fleet);
-        let old = Old(&wire, Mutex::default());
+        let works = Mutex::new(Vec::new());
+        // polls as a version without AOVs writes them, where the word is not known
+        let old = Tap(cluster.wire(&fleet), |wire: &Wire, poll: &Poll| {
+            let mut written = serde_json::to_value(poll).unwrap();
+            assert!(written.as_object_mut().unwrap().remove("aovs").is_some());
+            let answer = wire.poll(&serde_json::from_value(written).unwrap())?;
+            if let Answer::Work { work, .. } = &answer {
+                works.lock().unwrap().push((**work).clone());
+            }
+            Ok(answer)
+        });
         std::thread::scope(|scope| {
             let aside = Station::new(
                 &old,
@@ -123,7 +112,7 @@ fn a_worker_that_knows_no_layers_works_only_for_jobs_without() {
             result.unwrap();
         });
         assert!(cluster.picture(1) == expected(&spec), "layers: {layers}");
-        let works = old.1.into_inner().unwrap();
+        let works = works.lock().unwrap();
         // a scene is the same with and without
         let of_stage = works.iter().filter(|w| !matches!(w, super::super::Work::Prepare { .. })).count();
         assert_eq!(of_stage == 0, layers, "{works:?}");
