@@ -211,7 +211,62 @@ pub async fn load(client: &Client, namespace: &str, name: &str, now: i64) -> Res
 
 #[cfg(test)]
 mod tests {
+    use serde_json::{Value, json};
+
     use super::*;
+    use crate::tests::{Step, conflict, context, not_found, serve, step};
+
+    const SECRET: &str = "/api/v1/namespaces/rayherd/secrets/authority";
+
+    async fn loaded(now: i64, steps: Vec<Step>) -> (Roots, Vec<Value>) {
+        let (context, server) = context();
+        let serving = tokio::spawn(serve(server, steps));
+        let roots = load(&context.client, "rayherd", "authority", now).await.unwrap();
+        (roots, serving.await.unwrap())
+    }
+
+    #[tokio::test]
+    async fn of_operators_that_make_it_at_once_all_have_the_same() {
+        let begin = 1_800_000_000;
+        let secret = |roots: &Roots| {
+            let metadata = ObjectMeta {
+                name: Some("authority".into()),
+                resource_version: Some("7".into()),
+                ..ObjectMeta::default()
+            };
+            serde_json::to_value(roots.to_secret(metadata)).unwrap()
+        };
+        let theirs = Roots::renewed(None, begin).unwrap();
+        let other_was_faster = vec![
+            step("GET", SECRET, 404, not_found()),
+            step("POST", "/api/v1/namespaces/rayherd/secrets?", 409, conflict()),
+            step("GET", SECRET, 200, secret(&theirs)),
+        ];
+        let (roots, _) = loaded(begin, other_was_faster).await;
+        assert_eq!(roots, theirs);
+        // nothing is written where nothing is to be changed
+        let (roots, _) = loaded(begin, vec![step("GET", SECRET, 200, secret(&theirs))]).await;
+        assert_eq!(roots, theirs);
+        // renewed over the version that was read, and what the other made is taken where that was another
+        let late = begin + ROOT - NEXT + DAY;
+        let renewed = Roots::renewed(Some(theirs.clone()), late).unwrap();
+        let steps = vec![
+            step("GET", SECRET, 200, secret(&theirs)),
+            step("PUT", SECRET, 409, conflict()),
+            step("GET", SECRET, 200, secret(&renewed)),
+        ];
+        let (roots, said) = loaded(late, steps).await;
+        assert_eq!(roots, renewed);
+        assert_eq!(said[1].pointer("/metadata/resourceVersion"), Some(&json!("7")));
+        // an administrator has emptied it
+        let mut empty = secret(&theirs);
+        empty["data"] = json!({});
+        let steps = vec![step("GET", SECRET, 200, empty), step("PUT", SECRET, 200, secret(&theirs))];
+        let (roots, said) = loaded(begin, steps).await;
+        assert_ne!(roots, theirs);
+        let written: Secret = serde_json::from_value(said[1].clone()).unwrap();
+        assert_eq!(Roots::from_secret(&written), Some(roots));
+    }
 
     #[test]
     fn roots_overlap_and_survive_their_secret() {

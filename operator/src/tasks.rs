@@ -52,7 +52,7 @@ pub async fn open(context: &Arc<Context>) -> anyhow::Result<Tls> {
     let of_counter = context.clone();
     let refused = move || of_counter.metrics.refuse(Refused::Tls);
     let tls = Tls::listen(context.config.listen, current.clone(), refused).await?;
-    tokio::spawn(renew(context.clone(), current, serving.renew));
+    tokio::spawn(renew(context.clone(), current, serving.renew, HOUR));
     Ok(tls)
 }
 
@@ -65,10 +65,10 @@ async fn certificate(context: &Context) -> anyhow::Result<Serving> {
     Ok(roots.serving(context.config.host()?, now)?)
 }
 
-/// Has another certificate each half of its life, for as long as the process lives.
-async fn renew(context: Arc<Context>, current: Arc<Current>, mut due: i64) {
+/// Has another certificate each half of its life, for as long as the process lives; looks each `rest` whether it is time.
+async fn renew(context: Arc<Context>, current: Arc<Current>, mut due: i64, rest: Duration) {
     loop {
-        tokio::time::sleep(HOUR).await;
+        tokio::time::sleep(rest).await;
         if Timestamp::now().as_second() < due {
             continue;
         }
@@ -79,7 +79,7 @@ async fn renew(context: Arc<Context>, current: Arc<Current>, mut due: i64) {
             }
             Err(e) => {
                 context.metrics.errors.inc();
-                tracing::error!("the certificate is not renewed, which is tried again in an hour: {e:#}");
+                tracing::error!("the certificate is not renewed, which is tried again in {} s: {e:#}", rest.as_secs());
             }
         }
     }
@@ -201,13 +201,63 @@ fn proof(review: &TokenReview) -> Option<Proof> {
 
 #[cfg(test)]
 mod tests {
-    use serde_json::json;
+    use kube::client::Body;
+    use serde_json::{Value, json};
 
     use super::*;
+    use crate::tests::{Server as Mock, context, not_found};
+
+    /// Answers a request whose method and path are these with what `answer` makes of its body.
+    async fn answers(server: &mut Mock, asked: &str, status: u16, answer: impl Fn(Value) -> Value) -> Value {
+        let (request, send) = server.next_request().await.expect("a request");
+        let (parts, body) = request.into_parts();
+        assert!(
+            format!("{} {}", parts.method, parts.uri).starts_with(asked),
+            "{} {}, not {asked}",
+            parts.method,
+            parts.uri
+        );
+        let said: Value = serde_json::from_slice(&body.collect_bytes().await.unwrap()).unwrap_or_default();
+        let answer = Body::from(serde_json::to_vec(&answer(said.clone())).unwrap());
+        send.send_response(hyper::Response::builder().status(status).body(answer).unwrap());
+        said
+    }
+
+    #[tokio::test]
+    async fn the_certificate_is_another_when_it_is_due_whether_or_not_the_first_try_does_it() {
+        const SECRET: &str = "/api/v1/namespaces/rayherd/secrets";
+        let (context, mut server) = context();
+        let (get, post) = (format!("GET {SECRET}/authority"), format!("POST {SECRET}?"));
+        // the first operator makes the authority
+        let of_task = context.clone();
+        let first = tokio::spawn(async move { certificate(&of_task).await });
+        answers(&mut server, &get, 404, |_| not_found()).await;
+        let made = answers(&mut server, &post, 201, |said| said).await;
+        let serving = first.await.unwrap().unwrap();
+        assert!(serving.renew > Timestamp::now().as_second() + 7 * 24 * 3600);
+        let trusted = context.trusted.read().unwrap().clone();
+        assert_eq!(trusted.matches("BEGIN CERTIFICATE").count(), 1);
+        let current = Current::new(serving.key);
+        let before = current.now();
+        tokio::spawn(renew(context.clone(), current.clone(), 0, Duration::from_millis(10)));
+        let away = json!({"kind": "Status", "apiVersion": "v1", "status": "Failure", "code": 500, "message": "etcd"});
+        answers(&mut server, &get, 500, |_| away.clone()).await;
+        // it goes on with the one that it has, and tries again
+        answers(&mut server, &get, 200, |_| made.clone()).await;
+        while Arc::ptr_eq(&before, &current.now()) {
+            tokio::task::yield_now().await;
+        }
+        assert_ne!(before.cert, current.now().cert);
+        assert_eq!(*context.trusted.read().unwrap(), trusted, "of the same root");
+        // and that one for as long as it is good
+        let more = tokio::time::timeout(Duration::from_millis(200), server.next_request()).await;
+        assert!(more.is_err(), "nothing is asked for");
+        assert_eq!(context.metrics.errors.get(), 1);
+    }
 
     #[test]
     fn only_a_good_token_for_us_that_is_bound_to_a_pod_proves_one() {
-        let review = |status: serde_json::Value| -> TokenReview {
+        let review = |status: Value| -> TokenReview {
             serde_json::from_value(json!({"metadata": {}, "spec": {}, "status": status})).unwrap()
         };
         let user = json!({"username": "x", "extra": {"authentication.kubernetes.io/pod-uid": ["p-1"]}});
