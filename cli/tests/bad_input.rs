@@ -469,7 +469,11 @@ fn what_is_odd_is_told() {
     assert!(!run.err.contains("one-sided") && checked.err.is_empty(), "{}{}", run.err, checked.err);
     let (run, checked) = (render("flat.xml"), bed.line("check flat.xml"));
     for run in [&run, &checked] {
-        assert!(run.code == 0 && run.err.contains("flat.xml:3: to_world flattens this shape \"cube\""), "{}", run.err);
+        assert!(
+            run.code == 0 && run.err.contains("flat.xml:3:23: to_world flattens this shape \"cube\""),
+            "{}",
+            run.err
+        );
     }
     let run = render("sheet.xml");
     assert!(run.code == 0 && run.err.is_empty(), "{}", run.err);
@@ -566,7 +570,7 @@ fn what_lies_outside_or_is_no_file() {
         ("render in/up.xml", &[&["in/up.xml:3"], outside].concat()),
         ("render in/absolute.xml", &[&["in/absolute.xml:3"], outside].concat()),
         ("render in/link.xml", &[&["in/link.xml:3"], outside].concat()),
-        ("render in/gone.xml", &["in/gone.xml:3", "does not exist"]),
+        ("render in/gone.xml", &["in/gone.xml:3", "mesh file \"gone.obj\" (there is no such file)"]),
         ("render in/folder.xml", &["folder.obj", "not a regular file"]),
         ("render in/include.xml", &[&["in/include.xml:2"], outside].concat()),
         ("render in/device.xml", &["in/device.xml:2", "outside"]),

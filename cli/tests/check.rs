@@ -52,7 +52,7 @@ fn materials_of_a_mesh_are_told() {
     fs::write(folder.path().join("s.xml"), scene).unwrap();
     let run = check(&["s.xml"]);
     assert!(run.code == 0 && !run.err.contains("a.mtl"), "{}", run.err);
-    assert!(run.err.contains("s.xml:2: sensor \"two\" is left out"), "{}", run.err);
+    assert!(run.err.contains("s.xml:2:1: sensor \"two\" is left out"), "{}", run.err);
 }
 
 /// Everything wrong is told at once: what is not supported, and each file that is broken.
@@ -63,14 +63,20 @@ fn all_problems_are_named() {
         <shape type='ply'><string name='filename' value='cut.ply'/></shape>\n\
         <shape type='rectangle'><bsdf type='ward'/></shape>\n\
         <shape type='obj'><string name='filename' value='good.obj'/></shape>\n\
-        <emitter type='constant'/><sensor type='perspective'/></scene>";
+        <emitter type='constant'/><sensor type='perspective'/>\n\
+        <shape type='serialized'><string name='filename' value='gone.serialized'/></shape></scene>";
     fs::write(folder.path().join("s.xml"), text).unwrap();
     fs::write(folder.path().join("cut.ply"), "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\n").unwrap();
     fs::write(folder.path().join("good.obj"), "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 nan\nf 1 2 3\nf 1 1 2\nf 1 2 4\n")
         .unwrap();
     let run = rayherd(folder.path(), &["check", "s.xml"]);
     assert_eq!(run.code, 2, "{}", run.err);
-    for part in ["cut.ply", "s.xml:4: bsdf \"ward\" is not supported", "error: 2 problems in s.xml"] {
+    for part in [
+        "s.xml:7:26: mesh file \"gone.serialized\" (there is no such file)",
+        "cut.ply",
+        "s.xml:4:25: bsdf \"ward\" is not supported",
+        "error: 3 problems in s.xml",
+    ] {
         assert!(run.err.contains(part), "no {part:?} in {}", run.err);
     }
     for part in ["5 triangles", "1 of zero area, 1 with NaN", "1 rectangle, cube", "sky of"] {
@@ -109,9 +115,13 @@ fn bad_textures_are_named_together() {
     fs::write(folder.path().join("good.hdr"), format!("{head}abcdefgh")).unwrap();
     let run = rayherd(folder.path(), &["check", "s.xml"]);
     assert_eq!(run.code, 2, "{}", run.err);
-    for part in
-        ["s.xml:2: texture file \"gone.png\"", "s.xml:3: texture file \"text.jpg\"", "s.xml:4", "cut.hdr", "3 problems"]
-    {
+    for part in [
+        "s.xml:2:88: texture file \"gone.png\"",
+        "s.xml:3:88: texture file \"text.jpg\"",
+        "s.xml:4",
+        "cut.hdr",
+        "3 problems",
+    ] {
         assert!(run.err.contains(part), "no {part:?} in {}", run.err);
     }
     assert!(run.out.contains("textures     2: 2 image; 24 B of texels"), "{}", run.out);

@@ -162,11 +162,11 @@ fn stand_ins_are_told() {
     let text = "<scene version='3.0.0'>\n<shape type='rectangle'>\n<bsdf type='ward'/></shape>\n<emitter type='constant'/></scene>";
     fs::write(folder.path().join("s.xml"), text).unwrap();
     let render = ["render", "s.xml", "--size", "8x8", "--spp", "1", "--report", "r.json"];
-    assert_mistake(&rayherd(folder.path(), &render), &["s.xml:3: bsdf \"ward\"", "--substitute"]);
+    assert_mistake(&rayherd(folder.path(), &render), &["s.xml:3:1: bsdf \"ward\"", "--substitute"]);
     assert!(!folder.path().join("s.exr").exists() && !folder.path().join("r.json").exists());
     let run = rayherd(folder.path(), &[&render[..], &["--substitute"]].concat());
     assert_eq!(run.code, 0, "{}", run.err);
-    let warning = "s.xml:3: bsdf \"ward\" is not supported; in its place: ";
+    let warning = "s.xml:3:1: bsdf \"ward\" is not supported; in its place: ";
     let stand_in = run.err.lines().find_map(|l| l.split_once(warning)).unwrap_or_else(|| panic!("{}", run.err)).1;
     assert!(stand_in.contains("diffuse"), "{stand_in}");
     let report: Value = serde_json::from_slice(&fs::read(folder.path().join("r.json")).unwrap()).unwrap();

@@ -18,13 +18,29 @@ pub struct Place {
     pub file: PathBuf,
     /// Line from 1; 0 when the file has no lines.
     pub line: u32,
+    /// Column from 1, in bytes (of XML that is not well-formed, in characters); 0 when the whole line is meant, or the file has no lines.
+    #[serde(default)]
+    pub column: u32,
+}
+
+impl Place {
+    /// A whole file.
+    pub fn file(path: impl Into<PathBuf>) -> Self {
+        Place::line(path, 0)
+    }
+    /// A whole line.
+    pub fn line(path: impl Into<PathBuf>, line: u32) -> Self {
+        Place { file: path.into(), line, column: 0 }
+    }
 }
 
 impl std::fmt::Display for Place {
     fn fmt(&self, f: &mut std::fmt::Formatter) -> std::fmt::Result {
-        match self.line {
-            0 => write!(f, "{}", self.file.display()),
-            line => write!(f, "{}:{line}", self.file.display()),
+        let file = self.file.display();
+        match (self.line, self.column) {
+            (0, _) => write!(f, "{file}"),
+            (line, 0) => write!(f, "{file}:{line}"),
+            (line, column) => write!(f, "{file}:{line}:{column}"),
         }
     }
 }

@@ -1,6 +1,5 @@
 //! Scenes made of triangles, and what becomes of them on the whole way: prepared, cut, traced.
 
-use std::path::PathBuf;
 use std::sync::Arc;
 
 use rayherd_render::bvh::Forest;
@@ -17,7 +16,7 @@ pub type Wide = [[f64; 3]; 3];
 pub fn shape(triangles: &[Wide], material: u32, emission: Option<[f32; 3]>) -> Shape {
     Shape {
         name: format!("material {material}"),
-        place: Place { file: PathBuf::from("made"), line: 1 },
+        place: Place::line("made", 1),
         geometry: Geometry::Inline {
             positions: triangles.as_flattened().to_vec(),
             normals: vec![],

@@ -64,7 +64,7 @@ pub(super) fn meshes(
                 let head = super::obj::head(path)?;
                 out.bytes_read += head.bytes_read;
                 if let Some(text) = head.passed_over() {
-                    let place = Place { file: path.into(), line: head.line };
+                    let place = Place::line(path, head.line);
                     out.notes.push(Note { place, text: text.into() });
                 }
                 let folder = inside::folder_of(path)?;
@@ -81,7 +81,7 @@ pub(super) fn meshes(
             MeshFormat::Stl if looks => {
                 let head = passed_over(path, format);
                 out.bytes_read += head.bytes_read;
-                let place = Place { file: path.into(), line: 0 };
+                let place = Place::file(path);
                 out.notes.extend(head.colors.map(|text| Note { place, text: text.into() }));
             }
             _ => {}
@@ -157,7 +157,7 @@ fn color_material(out: &mut Description) -> u32 {
 fn shape(path: &Path, geometry: Geometry) -> Shape {
     Shape {
         name: path.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default(),
-        place: Place { file: path.into(), line: 0 },
+        place: Place::file(path),
         geometry,
         to_world: Affine::IDENTITY,
         material: 0,

@@ -32,5 +32,5 @@ pub(super) fn check_entry(path: &Path, folder: &Path) -> Result<(), ImportError>
     }
     let io = |source| ImportError::Io { path: folder.into(), source };
     let name = path.file_name().unwrap_or_default().to_string_lossy();
-    check(path, &folder.canonicalize().map_err(io)?, name, &Place { file: path.into(), line: 0 })
+    check(path, &folder.canonicalize().map_err(io)?, name, &Place::file(path))
 }

@@ -126,7 +126,9 @@ fn read(path: &Path, options: &ImportOptions, looks: bool) -> Result<(Descriptio
         },
     };
     if out.shapes.is_empty() {
-        return refuse(path, "the scene has no shapes: there is nothing to render");
+        let left_out: Vec<String> =
+            out.substitutions.iter().map(|s| format!("; left out: {}: {}", s.place, s.what)).collect();
+        return refuse(path, format!("the scene has no shapes: there is nothing to render{}", left_out.concat()));
     }
     out.bytes_read += head;
     Ok((out, up, bare))
@@ -226,7 +228,7 @@ fn kind_of(path: &Path, head: &[u8]) -> Result<Kind, ImportError> {
 
 /// An error about the source as a whole.
 fn refuse<T>(path: &Path, message: impl Into<String>) -> Result<T, ImportError> {
-    Err(ImportError::Malformed { place: Place { file: path.into(), line: 0 }, message: message.into() })
+    Err(ImportError::Malformed { place: Place::file(path), message: message.into() })
 }
 
 #[cfg(test)]

@@ -183,7 +183,7 @@ mod tests {
                 ),
             ] {
                 let told = walled(&inside, lens).unwrap_or_else(|| panic!("{inside}"));
-                assert!(told.contains("s.xml:2: ") && told.contains("shape \"wall\":"), "{told}");
+                assert!(told.contains("s.xml:2:1: ") && told.contains("shape \"wall\":"), "{told}");
             }
         }
         for inside in [

@@ -144,13 +144,13 @@ impl Source {
 
     /// An error at the last line read.
     pub fn fail_line<T>(&self, message: impl Into<String>) -> Result<T, ImportError> {
-        let place = Place { file: self.path.clone(), line: self.line.max(1) };
+        let place = Place::line(&self.path, self.line.max(1));
         Err(ImportError::Malformed { place, message: message.into() })
     }
 
     /// An error at a byte.
     pub fn fail_byte<T>(&self, message: impl std::fmt::Display) -> Result<T, ImportError> {
-        let place = Place { file: self.path.clone(), line: 0 };
+        let place = Place::file(&self.path);
         Err(ImportError::Malformed { place, message: format!("byte {}: {message}", self.offset) })
     }
 

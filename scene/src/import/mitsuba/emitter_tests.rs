@@ -43,9 +43,9 @@ fn a_bad_envmap_is_refused_with_its_place() {
     };
     let envmap = |inside: &str| whole(&format!("<emitter type=\"envmap\">{inside}</emitter>"));
     let file = "<string name=\"filename\" value=\"sky.hdr\"/>";
-    assert!(envmap("").contains("s.xml:2: an envmap without a filename"), "{}", envmap(""));
+    assert!(envmap("").contains("s.xml:2:1: an envmap without a filename"), "{}", envmap(""));
     let bad = envmap(&format!("{file}<float name=\"scale\" value=\"-1\"/>"));
-    assert!(bad.contains("s.xml:2: scale -1 should be above 0"), "{bad}");
+    assert!(bad.contains("s.xml:2:1: scale -1 should be above 0"), "{bad}");
     let sheared = "<transform name=\"to_world\"><scale x=\"2\"/></transform>";
     assert!(envmap(&format!("{file}{sheared}")).contains("should be a rotation"));
     let two = format!("<emitter type=\"envmap\">{file}</emitter><emitter type=\"constant\"/>");
@@ -61,7 +61,7 @@ fn a_bad_envmap_is_refused_with_its_place() {
     std::fs::write(dir.path().join("sky.hdr"), &SKY[..SKY.len() - 1]).unwrap();
     assert!(error().contains("sky.hdr: "), "{}", error());
     std::fs::write(dir.path().join("sky.hdr"), b"#?RGBE\n\n-Y 1 +X 1\n\x80\x80\x80\x80").unwrap();
-    assert!(error().contains("s.xml:2: ") && error().contains("1 x 2 at least"), "{}", error());
+    assert!(error().contains("s.xml:2:1: ") && error().contains("1 x 2 at least"), "{}", error());
 }
 
 #[test]

@@ -1,13 +1,13 @@
 //! Nothing is read and then silently left out: each parameter that changes nothing has a note, and each that would change the picture is unsupported or wrong.
 
-use super::tests::{CUBE, message, scene};
+use super::tests::{CUBE, columnless, message, scene};
 use crate::description::Bsdf;
 use crate::import::tests::{folder, write};
 use crate::import::{ImportOptions, import};
 
 fn notes(inside: &str) -> String {
     let found = scene(inside).unwrap_or_else(|e| panic!("{inside}: {e}"));
-    found.notes.iter().map(|n| format!("{}: {}\n", n.place, n.text)).collect()
+    columnless(&found.notes.iter().map(|n| format!("{}: {}\n", n.place, n.text)).collect::<String>())
 }
 
 fn bsdf(inside: &str) -> String {
@@ -126,7 +126,7 @@ fn what_would_change_the_picture_is_refused() {
             "s.xml:3: roughness -1 should lie",
         ),
     ] {
-        let message = message(&inside);
+        let message = columnless(&message(&inside));
         assert!(message.contains(part), "no {part:?} for {inside}: {message}");
     }
 }
@@ -201,7 +201,7 @@ fn materials_and_colours_of_meshes_have_notes() {
         if part.is_empty() {
             assert_eq!(found, "", "{file}");
         } else {
-            assert!(found.contains("s.xml:2: ") && found.contains(part), "{file}: {found:?}");
+            assert!(found.contains("s.xml:2:1: ") && found.contains(part), "{file}: {found:?}");
         }
         assert_eq!(read("<bsdf type='diffuse'/>"), "", "{file} with a material of its own");
         // of a bare mesh colours are all the same, but a PLY's, which are read

@@ -23,7 +23,7 @@ fn lenses_and_parallel_projection() {
     let (camera, size) = self::camera("orthographic", map, "");
     assert_eq!((camera.projection, camera.to_world.0[0][0], size), (Projection::Orthographic, 3.0, [200, 100]));
     let bad = format!("{CUBE}\n<sensor type=\"thinlens\"/>");
-    assert!(message(&bad).contains("s.xml:3: a thinlens without an aperture_radius"), "{}", message(&bad));
+    assert!(message(&bad).contains("s.xml:3:1: a thinlens without an aperture_radius"), "{}", message(&bad));
     let bad = format!("{CUBE}\n<sensor type=\"thinlens\"><float name=\"aperture_radius\" value=\"-1\"/></sensor>");
     assert!(message(&bad).contains("aperture_radius -1"), "{}", message(&bad));
     let bad = format!("{CUBE}\n<sensor type=\"orthographic\"><float name=\"fov\" value=\"40\"/></sensor>");

@@ -176,6 +176,12 @@ impl Converter<'_> {
         let Some((name, place)) = self.string(id, "filename")? else {
             return malformed(&object.place, format!("shape \"{}\" lacks its filename", object.plugin));
         };
+        // one of many, perhaps: all are listed
+        if !self.document.exists(name, place) {
+            self.unsupported(place, format!("mesh file \"{name}\" (there is no such file)"), "nothing");
+            object.properties.iter().for_each(|p| p.used.set(true));
+            return Ok(None);
+        }
         let path = self.document.resolve(name, place)?;
         let flip_v = self.boolean(id, "flip_tex_coords")?.unwrap_or(flip_v);
         // 0.6: normals above this crease angle are split; without it its default is to use what the file has

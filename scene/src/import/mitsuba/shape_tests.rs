@@ -30,7 +30,7 @@ fn disks_and_cylinders() {
     );
     assert!(close(lo, [1.0, -0.5, -0.5]) && close(hi, [4.0, 0.5, 0.5]) && n == 1024, "{lo:?} {hi:?} {n}");
     let bad = message("<shape type=\"cylinder\"><float name=\"radius\" value=\"0\"/></shape>");
-    assert!(bad.contains("s.xml:2: a cylinder needs"), "{bad}");
+    assert!(bad.contains("s.xml:2:1: a cylinder needs"), "{bad}");
 }
 
 #[test]
@@ -63,7 +63,7 @@ fn instances_are_laid_out() {
         .fold(0.0, f64::max);
     assert_eq!(furthest, 12.0);
     let wrong = message(&format!("{CUBE}\n<shape type=\"instance\"/>"));
-    assert!(wrong.contains("s.xml:3: an instance needs one shapegroup"), "{wrong}");
+    assert!(wrong.contains("s.xml:3:1: an instance needs one shapegroup"), "{wrong}");
     let wrong = message("<shape type=\"cube\" id=\"c\"/>\n<shape type=\"instance\"><ref id=\"c\"/></shape>");
-    assert!(wrong.contains("s.xml:3: what an instance refers to"), "{wrong}");
+    assert!(wrong.contains("s.xml:3:24: what an instance refers to"), "{wrong}");
 }

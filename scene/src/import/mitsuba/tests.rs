@@ -22,6 +22,18 @@ pub(super) fn message(inside: &str) -> String {
     scene(inside).unwrap_err().to_string()
 }
 
+/// The same with a whole line for each place of the scene.
+pub(super) fn columnless(text: &str) -> String {
+    let mut parts = text.split(".xml:");
+    let mut out = parts.next().unwrap_or_default().to_owned();
+    for part in parts {
+        let (line, rest) = part.split_once(':').unwrap_or((part, ""));
+        let rest = rest.trim_start_matches(|c: char| c.is_ascii_digit());
+        out += &format!(".xml:{line}{rest}");
+    }
+    out
+}
+
 pub(super) const CUBE: &str = "<shape type=\"cube\"/>";
 
 /// Field of view of a pinhole.
@@ -346,7 +358,7 @@ fn all_that_is_unsupported_is_listed() {
         ]
     );
     let shown = ImportError::Unsupported(list).to_string();
-    assert!(shown.starts_with("9 unsupported") && shown.contains("s.xml:9: property \"wobble\""), "{shown}");
+    assert!(shown.starts_with("9 unsupported") && shown.contains("s.xml:9:1: property \"wobble\""), "{shown}");
 
     let options = ImportOptions { substitute: true, ..ImportOptions::default() };
     let out = scene_with(text, &options).unwrap();
@@ -396,8 +408,14 @@ fn what_is_wrong_has_file_line_and_remedy() {
         ("<bsdf type=\"twosided\"/>", "needs one or two materials"),
         ("<shape/>", "lacks its attribute \"type\""),
         ("<shape type=\"ply\"/>", "lacks its filename"),
-        ("<shape type=\"ply\"><string name=\"filename\" value=\"no.ply\"/></shape>", "does not exist"),
-        ("<shape type=\"ply\"><string name=\"filename\" value=\"\"/></shape>", "no file name"),
+        (
+            "<shape type=\"ply\"><string name=\"filename\" value=\"no.ply\"/></shape>",
+            "mesh file \"no.ply\" (there is no such file)",
+        ),
+        (
+            "<shape type=\"ply\"><string name=\"filename\" value=\"\"/></shape>",
+            "mesh file \"\" (there is no such file)",
+        ),
         ("<include filename=\"no.xml\"/>", "does not exist"),
         ("<shape type=\"cube\"><float name=\"flip_normals\" value=\"1\"/></shape>", "should be a <boolean>"),
         ("<shape type=\"cube\"><boolean name=\"flip_normals\" value=\"1\"/></shape>", "neither true nor false"),
@@ -428,7 +446,7 @@ fn what_is_wrong_has_file_line_and_remedy() {
         ("<default name=\"\" value=\"y\"/>", "empty name"),
     ] {
         let error = message(inside);
-        assert!(error.contains("s.xml:2: ") && error.contains(what), "{inside}: {error}");
+        assert!(error.contains("s.xml:2:") && error.contains(what), "{inside}: {error}");
     }
     let film = |inside: &str| {
         message(&format!("{CUBE}<sensor type=\"perspective\"><film type=\"hdrfilm\">{inside}</film></sensor>"))

@@ -265,7 +265,7 @@ fn attributes_are_what_the_mesh_is_read_for() {
     for (scene, what) in [
         (
             mesh("m.obj", &diffuse("vertex_color")),
-            "s.xml:2: mesh attribute \"vertex_color\" of shape \"obj\", which has none",
+            "s.xml:2:1: mesh attribute \"vertex_color\" of shape \"obj\", which has none",
         ),
         (mesh("m.ply", &two), "mesh attribute \"face_heat\" beside \"vertex_color\" on one shape"),
         (mesh("m.ply", &bump), "mesh_attribute as a bumpmap"),
@@ -297,7 +297,7 @@ fn light_may_be_textured() {
     assert_eq!(c.colors, [[5.0, 6.0, 7.0], [0.2; 3]]);
     let missing = area.replace("a.hdr", "none.hdr");
     let error = scene_with(&shape(&missing), false).unwrap_err().to_string();
-    assert!(error.contains("s.xml:2: texture file \"none.hdr\" (there is no such file)"), "{error}");
+    assert!(error.contains("s.xml:2:80: texture file \"none.hdr\" (there is no such file)"), "{error}");
     let out = scene_with(&shape(&missing), true).unwrap();
     assert_eq!((out.shapes[0].emission, out.shapes[0].emission_texture), (Some([1.0; 3]), None));
     let negative = squares.replace("5, 6", "5, -6");

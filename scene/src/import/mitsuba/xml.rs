@@ -111,7 +111,7 @@ impl Document {
         };
         reader.file(path, &canonical, None, &mut parameters)?;
         if let Some(name) = parameters.unused_define() {
-            let place = Place { file: path.into(), line: 0 };
+            let place = Place::file(path);
             let message =
                 format!("-D {name}: the scene has no parameter ${name}; the names it has are {}", parameters.names());
             return Err(ImportError::Malformed { place, message });
@@ -278,29 +278,22 @@ impl Reader {
             return Err(ImportError::Limit { path: path.into(), message });
         }
         self.document.bytes_read += text.len() as u64;
-        let whole = |message: String| ImportError::Malformed { place: Place { file: path.into(), line: 0 }, message };
+        let whole = |message: String| ImportError::Malformed { place: Place::file(path), message };
         let text = String::from_utf8(text).map_err(|e| {
             whole(format!("byte {} is not UTF-8; save the file as UTF-8", e.utf8_error().valid_up_to()))
         })?;
         let text = text.strip_prefix('\u{feff}').unwrap_or(&text);
         if let Some(offset) = crowded_element(text) {
-            let line = text[..offset].lines().count() as u32;
-            return malformed(
-                &Place { file: path.into(), line },
-                format!("an element with more than {MAX_ATTRIBUTES} attributes"),
-            );
+            let place = Lines::of(text).place(path, offset.saturating_sub(1));
+            return malformed(&place, format!("an element with more than {MAX_ATTRIBUTES} attributes"));
         }
         let options = roxmltree::ParsingOptions { nodes_limit: MAX_NODES, ..Default::default() };
         let xml = roxmltree::Document::parse_with_options(text, options).map_err(|e| ImportError::Malformed {
-            place: Place { file: path.into(), line: e.pos().row },
+            place: Place { file: path.into(), line: e.pos().row, column: e.pos().col },
             message: format!("not well-formed XML: {e}"),
         })?;
-        // rows by binary search: roxmltree's own look-up is linear in the offset
-        let lines: Vec<usize> = text.bytes().enumerate().filter(|(_, b)| *b == b'\n').map(|(i, _)| i).collect();
-        let place = |node: &roxmltree::Node| {
-            let line = lines.partition_point(|&i| i < node.range().start) as u32 + 1;
-            Place { file: path.into(), line }
-        };
+        let lines = Lines::of(text);
+        let place = |node: &roxmltree::Node| lines.place(path, node.range().start);
 
         self.including.push(canonical.to_path_buf());
         let root = xml.root_element();
@@ -461,6 +454,22 @@ impl Reader {
             return malformed(&element.place, format!("more than {MAX_INCLUDES} includes, or deeper than {MAX_DEPTH}"));
         }
         self.file(&path.clone(), &path, Some((parent, depth + 1, name)), parameters)
+    }
+}
+
+/// Where the lines of a text begin: places by binary search, as roxmltree's own look-up is linear in the offset.
+struct Lines(Vec<usize>);
+
+impl Lines {
+    fn of(text: &str) -> Self {
+        let ends = text.bytes().enumerate().filter(|(_, b)| *b == b'\n').map(|(i, _)| i + 1);
+        Lines(std::iter::once(0).chain(ends).collect())
+    }
+    /// Of a byte. At most [`MAX_BYTES`] are read: both numbers fit.
+    fn place(&self, path: &Path, offset: usize) -> Place {
+        let line = self.0.partition_point(|&start| start <= offset);
+        let column = offset - self.0[line - 1] + 1;
+        Place { file: path.into(), line: line as u32, column: column as u32 }
     }
 }
 

@@ -59,7 +59,7 @@ impl Libraries<'_> {
         let mut seen = std::collections::HashSet::new();
         for (name, line) in names {
             parts.libraries.push(name.clone());
-            let place = Place { file: obj.into(), line: *line };
+            let place = Place::line(obj, *line);
             for path in self.paths(folder, name, &place)? {
                 for entry in entries(&path, &mut self.out.bytes_read)? {
                     if !seen.insert(entry.name.clone()) {
@@ -129,7 +129,7 @@ fn entries(path: &Path, bytes_read: &mut u64) -> Result<Vec<Entry>, ImportError>
             continue;
         }
         let (file, line) = source.place();
-        let place = Place { file: file.into(), line };
+        let place = Place::line(file, line);
         let (keyword, rest) = text.split_once(|c: char| c.is_ascii_whitespace()).unwrap_or((&text, ""));
         let rest = rest.trim();
         if keyword.eq_ignore_ascii_case("newmtl") {

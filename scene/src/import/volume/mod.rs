@@ -142,7 +142,7 @@ fn format(path: &Path, bytes: &Bytes) -> Result<Option<Format>, ImportError> {
 
 /// An error of the content.
 fn malformed(path: &Path, line: u32, message: impl Into<String>) -> ImportError {
-    ImportError::Malformed { place: crate::description::Place { file: path.to_owned(), line }, message: message.into() }
+    ImportError::Malformed { place: crate::description::Place::line(path, line), message: message.into() }
 }
 
 /// A map from sample numbers to the world by its linear part (row, column) and its translation; refused unless finite and
