@@ -224,9 +224,13 @@ pub struct ImageSpec {
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub cameras: Vec<CameraSpec>,
     /// The EXR file; the PNG stands beside it. With several cameras `-NAME` or `-0001`.. comes before the extension. A cluster writes
-    /// them as `output/NAMESPACE/NAME/` and this path, onto each server of the job's storage.
+    /// them as `prefix`, a slash and this path, onto each server of the job's storage.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub output: Option<String>,
+    /// The folder of the job's storage in which a cluster writes the pictures; `output/NAMESPACE/NAME` by default, which no other job has.
+    /// Jobs that name the same folder and file overwrite each other's. `rayherd render` does not look at it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub prefix: Option<String>,
     /// Which of the files are written; both by default. May change: a finished job writes what is asked for anew.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[schemars(length(min = 1, max = 2), extend("default" = ["Exr", "Png"], "x-kubernetes-list-type" = "set"))]
@@ -238,6 +242,19 @@ pub struct ImageSpec {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[schemars(range(min = -32.0, max = 32.0), extend("default" = 0.0))]
     pub exposure: Option<f64>,
+}
+
+impl ImageSpec {
+    /// Folders of a storage that are Rayherd's own.
+    pub const TAKEN: [&str; 4] = ["deleted", "jobs", "names", "objects"];
+
+    /// The key of a picture of a cluster's job, from its path as `output` gives it.
+    pub fn key(&self, namespace: &str, job: &str, path: &str) -> String {
+        match &self.prefix {
+            Some(prefix) => format!("{prefix}/{path}"),
+            None => format!("output/{namespace}/{job}/{path}"),
+        }
+    }
 }
 
 /// A perspective camera.

@@ -81,10 +81,16 @@ pub const RULES: &[Rule] = &[
         "!has(self.output) || (self.output.endsWith('.exr') && self.output.size() > 4 && !self.output.startsWith('/') && !self.output.split('/').exists(p, p.startsWith('.')))",
         "spec.image.output ends in .exr and is a relative path",
     ),
+    (
+        IMAGE,
+        "!has(self.prefix) || (self.prefix.split('/').all(p, p != '' && !p.startsWith('.')) && !(self.prefix.split('/')[0] in ['deleted', 'jobs', 'names', 'objects']))",
+        "spec.image.prefix is a relative path such as shots/room, and not in deleted, jobs, names or objects, which are Rayherd's own",
+    ),
     (IMAGE, same!("size"), "spec.image.size cannot be changed: make another job"),
     (IMAGE, same!("cameras"), "spec.image.cameras cannot be changed: make another job"),
     (IMAGE, same!("aovs"), "spec.image.aovs cannot be changed: make another job"),
     (IMAGE, same!("output"), "spec.image.output cannot be changed: copy the picture, or make another job"),
+    (IMAGE, same!("prefix"), "spec.image.prefix cannot be changed: copy the picture, or make another job"),
     (CAMERA, "self.target != self.origin", "a camera's target is its origin: choose a point that it looks at"),
     (
         SAMPLING,

@@ -2,7 +2,7 @@
 
 use std::fmt;
 
-use crate::{API_VERSION, KIND, RenderJob};
+use crate::{API_VERSION, ImageSpec, KIND, RenderJob};
 
 /// Something wrong with a job, and what to do about it.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -150,6 +150,15 @@ fn check_image(c: &mut Checks, job: &RenderJob) {
     if let Some(output) = &image.output {
         c.check("spec.image.output", output.ends_with(".exr") && output.len() > 4, || {
             format!("is {output:?}: name a file that ends in .exr (the PNG stands beside it)")
+        });
+    }
+    if let Some(prefix) = &image.prefix {
+        let mut parts = prefix.split('/');
+        let relative = parts.clone().all(|p| !p.is_empty() && !p.starts_with('.'));
+        let taken = parts.next().is_some_and(|p| ImageSpec::TAKEN.contains(&p));
+        c.check("spec.image.prefix", relative && !taken, || {
+            let own = ImageSpec::TAKEN.join(", ");
+            format!("is {prefix:?}: give a relative path such as shots/room, and none in Rayherd's own folders: {own}")
         });
     }
     if let Some(files) = &image.files {
@@ -353,6 +362,7 @@ spec:
         spec.image.cameras[1].fov = 180.0;
         spec.image.cameras[1].name = Some("front".into());
         spec.image.output = Some("a.png".into());
+        spec.image.prefix = Some("jobs/u-1".into());
         spec.image.files = Some(vec![PictureFile::Png; 2]);
         spec.image.exposure = Some(f64::INFINITY);
         spec.sampling.spp = Some(1 << 25);
@@ -387,6 +397,7 @@ spec:
             "spec.image.cameras[1].up",
             "spec.image.cameras[1].fov",
             "spec.image.output",
+            "spec.image.prefix",
             "spec.image.files",
             "spec.image.exposure",
             "spec.sampling.spp",

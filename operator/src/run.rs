@@ -39,7 +39,7 @@ pub fn pictures(job: &RenderJobObject) -> Vec<String> {
     let namespace = job.metadata.namespace.clone().unwrap_or_default();
     let file = job.spec.image.output.clone().unwrap_or_else(|| format!("{name}.exr"));
     let cameras = &job.spec.image.cameras;
-    let path = |file: &str| format!("output/{namespace}/{name}/{file}");
+    let path = |file: &str| job.spec.image.key(&namespace, &name, file);
     if cameras.len() < 2 {
         return vec![path(&file)];
     }

@@ -218,7 +218,7 @@ fn pictures(job: &RenderJob, namespace: &str, output: &Path) -> Vec<(String, Pat
     let mut here = job.clone();
     here.spec.image.output = Some(output.to_string_lossy().into_owned());
     let extension = kind_of(output).extension();
-    let key = |there: PathBuf| format!("output/{namespace}/{name}/{}", there.with_extension(extension).display());
+    let key = |there: PathBuf| job.spec.image.key(namespace, &name, &there.with_extension(extension).to_string_lossy());
     let paths = frames::files(&here).into_iter();
     // a single one is named as it was given
     let paths = paths.map(|path| if path == output { path } else { path.with_extension(extension) });
@@ -310,6 +310,9 @@ mod tests {
                 pair("output/studio/box/film/part-0002.exr", "a/b-0002.exr"),
             ]
         );
+        job.spec.image.prefix = Some("shots".into());
+        assert_eq!(pictures(&job, "a/b.exr")[0], pair("shots/film/part-left.exr", "a/b-left.exr"));
+        job.spec.image.prefix = None;
         // the PNG, where the name asks for it
         let of_png = pictures(&job, "b.png");
         assert_eq!(of_png[0], pair("output/studio/box/film/part-left.png", "b-left.png"));
