@@ -201,57 +201,34 @@ fn proof(review: &TokenReview) -> Option<Proof> {
 
 #[cfg(test)]
 mod tests {
-    use kube::client::Body;
     use serde_json::{Value, json};
 
     use super::*;
-    use crate::tests::{Server as Mock, context, not_found};
-
-    /// Answers a request whose method and path are these with what `answer` makes of its body.
-    async fn answers(server: &mut Mock, asked: &str, status: u16, answer: impl Fn(Value) -> Value) -> Value {
-        let (request, send) = server.next_request().await.expect("a request");
-        let (parts, body) = request.into_parts();
-        assert!(
-            format!("{} {}", parts.method, parts.uri).starts_with(asked),
-            "{} {}, not {asked}",
-            parts.method,
-            parts.uri
-        );
-        let said: Value = serde_json::from_slice(&body.collect_bytes().await.unwrap()).unwrap_or_default();
-        let answer = Body::from(serde_json::to_vec(&answer(said.clone())).unwrap());
-        send.send_response(hyper::Response::builder().status(status).body(answer).unwrap());
-        said
-    }
+    use crate::tests::{context, not_found, serve_on, step};
 
     #[tokio::test]
     async fn the_certificate_is_another_when_it_is_due_whether_or_not_the_first_try_does_it() {
-        const SECRET: &str = "/api/v1/namespaces/rayherd/secrets";
+        const SECRET: &str = "/api/v1/namespaces/rayherd/secrets/authority";
         let (context, mut server) = context();
-        let (get, post) = (format!("GET {SECRET}/authority"), format!("POST {SECRET}?"));
         // the first operator makes the authority
-        let of_task = context.clone();
-        let first = tokio::spawn(async move { certificate(&of_task).await });
-        answers(&mut server, &get, 404, |_| not_found()).await;
-        let made = answers(&mut server, &post, 201, |said| said).await;
-        let serving = first.await.unwrap().unwrap();
+        let makes = vec![
+            step("GET", SECRET, 404, not_found()),
+            step("POST", "/api/v1/namespaces/rayherd/secrets?", 201, json!({"metadata": {}})),
+        ];
+        let (serving, said) = tokio::join!(certificate(&context), serve_on(&mut server, makes));
+        let serving = serving.unwrap();
         assert!(serving.renew > Timestamp::now().as_second() + 7 * 24 * 3600);
         let trusted = context.trusted.read().unwrap().clone();
         assert_eq!(trusted.matches("BEGIN CERTIFICATE").count(), 1);
         let current = Current::new(serving.key);
         let before = current.now();
         tokio::spawn(renew(context.clone(), current.clone(), 0, Duration::from_millis(10)));
+        // it goes on with the one that it has, tries again, and then is silent for as long as that one is good
         let away = json!({"kind": "Status", "apiVersion": "v1", "status": "Failure", "code": 500, "message": "etcd"});
-        answers(&mut server, &get, 500, |_| away.clone()).await;
-        // it goes on with the one that it has, and tries again
-        answers(&mut server, &get, 200, |_| made.clone()).await;
-        while Arc::ptr_eq(&before, &current.now()) {
-            tokio::task::yield_now().await;
-        }
+        serve_on(&mut server, vec![step("GET", SECRET, 500, away), step("GET", SECRET, 200, said[1].clone())]).await;
+        assert!(!Arc::ptr_eq(&before, &current.now()));
         assert_ne!(before.cert, current.now().cert);
         assert_eq!(*context.trusted.read().unwrap(), trusted, "of the same root");
-        // and that one for as long as it is good
-        let more = tokio::time::timeout(Duration::from_millis(200), server.next_request()).await;
-        assert!(more.is_err(), "nothing is asked for");
         assert_eq!(context.metrics.errors.get(), 1);
     }
 

@@ -225,6 +225,10 @@ fn every_rule_refuses_what_it_is_for_with_its_message_and_nothing_else() {
         assert!(said.len() == 1 && said[0].contains(message), "{message}: {said:?}");
         seen.insert(said[0].split_once(": ").unwrap().1.to_owned());
     }
+    for taken in crate::ImageSpec::TAKEN {
+        let said = said(&rules, &schema, None, with("/image/prefix", json!(format!("{taken}/a"))));
+        assert!(said.len() == 1 && said[0].contains("which are Rayherd's own"), "{taken}: {said:?}");
+    }
     // of one that is changed
     for (path, value, message) in [
         ("/splits", json!(33), "spec.splits cannot be changed"),

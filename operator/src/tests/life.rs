@@ -9,7 +9,6 @@ use super::*;
 use crate::jobs::{Problem, Running};
 
 const SLICES: &str = "/apis/discovery.k8s.io/v1/namespaces/store/endpointslices?";
-const PREFERRED: &str = "/spec/affinity/nodeAffinity/preferredDuringSchedulingIgnoredDuringExecution";
 const REQUIRED: &str =
     "/spec/affinity/nodeAffinity/requiredDuringSchedulingIgnoredDuringExecution/nodeSelectorTerms/0/matchExpressions/0";
 
@@ -109,10 +108,6 @@ fn pod(number: u32, containers: Value) -> Value {
         "spec": {"containers": [{"name": "worker", "resources": {"limits": {"memory": "200Mi"}}}]},
         "status": {"phase": "Running", "containerStatuses": containers},
     })
-}
-
-fn list(pods: Vec<Value>) -> Value {
-    json!({"kind": "PodList", "apiVersion": "v1", "metadata": {}, "items": pods})
 }
 
 #[tokio::test]

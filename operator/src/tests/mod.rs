@@ -56,7 +56,8 @@ pub async fn serve(mut server: Server, steps: Vec<Step>) -> Vec<Value> {
     serve_on(&mut server, steps).await
 }
 
-async fn serve_on(server: &mut Server, steps: Vec<Step>) -> Vec<Value> {
+/// The same, after which the server can be asked for more.
+pub async fn serve_on(server: &mut Server, steps: Vec<Step>) -> Vec<Value> {
     let mut said = Vec::new();
     for (number, step) in steps.into_iter().enumerate() {
         let next = tokio::time::timeout(Duration::from_secs(20), server.next_request()).await;
@@ -131,7 +132,11 @@ pub fn conflict() -> Value {
 }
 
 fn no_pods() -> Value {
-    json!({"kind": "PodList", "apiVersion": "v1", "metadata": {}, "items": []})
+    list(vec![])
+}
+
+fn list(pods: Vec<Value>) -> Value {
+    json!({"kind": "PodList", "apiVersion": "v1", "metadata": {}, "items": pods})
 }
 
 /// An event is published.
@@ -143,6 +148,8 @@ fn event(kind: &'static str, reason: &'static str) -> Step {
         .with("/regarding/uid", json!("u-1"))
 }
 
+/// Where a pod says which nodes it is drawn to.
+const PREFERRED: &str = "/spec/affinity/nodeAffinity/preferredDuringSchedulingIgnoredDuringExecution";
 const GET_JOB: &str = "/apis/rayherd.io/v1alpha1/namespaces/studio/renderjobs/box";
 const STATUS: &str = "/apis/rayherd.io/v1alpha1/namespaces/studio/renderjobs/box/status?";
 const JOB: &str = "/apis/rayherd.io/v1alpha1/namespaces/studio/renderjobs/box?";

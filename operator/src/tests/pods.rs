@@ -37,7 +37,6 @@ async fn the_first_worker_comes_up_beside_the_source() {
     servers[1].put_raw("scenes/box/box.xml", b"<scene version='3.0.0'/>");
     let pod = json!({"metadata": {"name": "box-w0", "uid": "p-0", "labels": {"rayherd.io/worker": "0"}}});
     let mut steps = begins_on(&servers, no_pods());
-    let nodes = "/spec/affinity/nodeAffinity/preferredDuringSchedulingIgnoredDuringExecution";
     steps.extend([
         step("PATCH", "/api/v1/namespaces/studio/pods/box-w0?", 201, pod)
             .with("/metadata/labels/rayherd.io~1placed", json!("false")),
@@ -45,7 +44,7 @@ async fn the_first_worker_comes_up_beside_the_source() {
     ]);
     let (done, said, context) = scenario(&job(), steps).await;
     assert_ne!(done.unwrap(), Action::await_change());
-    let terms = said[4].pointer(nodes).and_then(Value::as_array).expect("node affinity").clone();
+    let terms = said[4].pointer(PREFERRED).and_then(Value::as_array).expect("node affinity").clone();
     assert_eq!(terms.len(), 1, "{terms:?}");
     assert_eq!(terms[0].pointer("/preference/matchExpressions/0/values"), Some(&json!(["node2"])));
     context.jobs.get("u-1").expect("it runs").fleet.cancel("the test is over");
