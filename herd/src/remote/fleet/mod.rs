@@ -260,8 +260,8 @@ impl Fleet {
     /// When there is no worker of this number.
     pub fn report(&self, report: Report) -> Result<bool, Unknown> {
         let mut state = self.lock();
-        state.meet(&report.worker, None)?;
-        if state.doing.get(&report.id).is_none_or(|d| d.worker != report.worker.number) {
+        if !state.hear(&report.worker)? || state.doing.get(&report.id).is_none_or(|d| d.worker != report.worker.number)
+        {
             return Ok(false);
         }
         let Some(doing) = state.doing.remove(&report.id) else { return Ok(false) };
@@ -321,7 +321,9 @@ impl Fleet {
     /// When there is no worker of this number.
     pub fn beat(&self, beat: &Beat) -> Result<Vec<String>, Unknown> {
         let mut state = self.lock();
-        state.meet(&beat.worker, None)?;
+        if !state.hear(&beat.worker)? {
+            return Ok(beat.running.clone());
+        }
         if state.take_back(beat, UNHEARD) {
             self.tell();
         }

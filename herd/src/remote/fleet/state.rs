@@ -188,6 +188,16 @@ impl State {
         Ok(newcomer)
     }
 
+    /// Notes a sign of life; whether it is of the worker that has this number. Only who asks for work takes over the number of another: one that
+    /// was thought dead, and was replaced, has nothing to report, and must not cost its successor what it does.
+    pub fn hear(&mut self, worker: &WorkerId) -> Result<bool, Unknown> {
+        let known = self.workers.get(worker.number as usize).ok_or(Unknown)?.as_ref();
+        if known.is_some_and(|w| w.session != worker.session) {
+            return Ok(false);
+        }
+        self.meet(worker, None).map(|_| true)
+    }
+
     /// A worker is gone: what it did is lost, what it had not begun goes back, what any worker can do is done by another. Whether it was there.
     pub fn leave(&mut self, number: u32) -> bool {
         let Some(worker) = self.workers.get_mut(number as usize).and_then(Option::take) else { return false };

@@ -168,6 +168,11 @@ fn a_worker_that_comes_back_under_another_session_loses_only_its_tasks() {
         let beat = Beat { worker: poll("b").worker, running: vec![first.clone(), second.clone()] };
         assert_eq!(fleet.beat(&beat), Ok(vec![first]));
         assert_eq!((fleet.tally().running, fleet.tally().queued), (1, 0));
+        // the one before still goes on, and costs its successor nothing
+        assert_eq!(fleet.report(report("a", &second, Some(5.0))), Ok(false), "another session's");
+        let beat = Beat { worker: poll("a").worker, running: vec![second.clone()] };
+        assert_eq!(fleet.beat(&beat), Ok(vec![second.clone()]), "it need not go on");
+        assert_eq!((fleet.tally().running, fleet.tally().queued), (1, 0));
         assert_eq!(fleet.report(report("b", &second, Some(3.0))), Ok(true));
         assert_eq!(fleet.report(report("b", &second, Some(4.0))), Ok(false), "a replay");
         let tally = fleet.tally();
