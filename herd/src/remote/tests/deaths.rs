@@ -177,9 +177,7 @@ fn work_that_kills_its_worker_each_time_fails_the_job() {
                 hand.takes(&format!("s{session}"));
             }
             // the next process finds that the last one died as well
-            let worker = WorkerId { number: 0, session: "last".into() };
-            let beat = Beat { worker, running: vec![] };
-            hand.0.beat(&beat).unwrap();
+            hand.0.answer(&poll(0, "last")).unwrap();
             wait_for(over);
         });
         let said = done.unwrap_err().to_string();
