@@ -8,7 +8,7 @@ use super::progress::{PrepareProgress, Stage};
 use super::records::{ATTRIBUTES, Extra, NORMALS, Records, SphereBits, UVS};
 use super::spool::Spool;
 use super::{PrepareError, SpoolSettings};
-use crate::description::Description;
+use crate::description::{Description, Geometry, Shape};
 use crate::grid::count::{Box3, box_of};
 use crate::grid::lattice::{round_down, round_up};
 use crate::manifest::Counts;
@@ -21,13 +21,19 @@ const CHUNK: usize = 16_384;
 /// Source coordinates beyond this are not used. Recentring at most doubles it, which blocks can still hold.
 const LARGEST: f64 = (MAX_COORDINATE / 2.0) as f64;
 
-/// Bounds of a source, f64.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub(crate) struct SourceBounds {
-    pub lo: [f64; 3],
-    pub hi: [f64; 3],
+/// Bytes of records that are kept where the bounds were found, so that the source is not read again; and of files that are tried. No setting: the manifest
+/// says how often the source was read. As much as waits in memory anyway ([`SpoolSettings::default`]).
+const KEPT: u64 = 64 << 20;
+
+/// A source whose bounds were looked for.
+#[derive(Debug)]
+pub(crate) struct Seen {
+    /// Least and greatest corner, f64; none where nothing is usable.
+    pub bounds: Option<[[f64; 3]; 2]>,
     /// Bytes read to find them.
     pub bytes: u64,
+    /// All records, if they are few enough.
+    pub kept: Option<Vec<Vec<Record>>>,
 }
 
 /// All usable records, and what they are together.
@@ -72,47 +78,74 @@ enum Skip {
     OutOfRange,
 }
 
-/// Shows every record of a pass to `see`, in order; the bytes that were read for it.
+/// Shows the records of a pass to `see`, in order, many at a time, which it may take; the bytes that were read for it.
 fn each(
     mut stream: Box<dyn RecordStream + '_>,
     stage: Stage,
     progress: &dyn PrepareProgress,
-    mut see: impl FnMut(&Record) -> Result<(), PrepareError>,
+    mut see: impl FnMut(&mut Vec<Record>) -> Result<(), PrepareError>,
 ) -> Result<u64, PrepareError> {
     progress.begin(stage, None);
-    let mut batch = Vec::with_capacity(BATCH);
+    let mut batch = Vec::new();
     loop {
         batch.clear();
+        batch.reserve_exact(BATCH);
         let n = stream.next(&mut batch, BATCH)?;
         if n == 0 {
             return Ok(stream.bytes_read());
         }
         progress.advance(n as u64);
-        batch.iter().try_for_each(&mut see)?;
+        see(&mut batch)?;
     }
 }
 
-/// A pass over the source that finds its bounds.
+/// How many bytes of records are to be kept of a source: none where its files are so large that they would hardly fit.
+pub(crate) fn to_keep(description: &Description) -> u64 {
+    let size = |shape: &Shape| match &shape.geometry {
+        // what cannot be looked at is told when it is read
+        Geometry::MeshFile { path, .. } => std::fs::metadata(path).map_or(0, |m| m.len()),
+        // nobody knows how many triangles it has
+        Geometry::IsoSurface { .. } => u64::MAX,
+        Geometry::Inline { .. } | Geometry::Sphere { .. } | Geometry::Part => 0,
+    };
+    let all = description.shapes.iter().map(size).fold(0, u64::saturating_add);
+    if all <= KEPT { KEPT } else { 0 }
+}
+
+/// A pass over the source that finds its bounds, and keeps its records if they take no more than `most` bytes.
 pub(crate) fn bounds(
     source: &dyn RecordSource,
+    most: u64,
     progress: &dyn PrepareProgress,
-) -> Result<Option<SourceBounds>, PrepareError> {
+) -> Result<Seen, PrepareError> {
     let (mut lo, mut hi) = ([f64::INFINITY; 3], [f64::NEG_INFINITY; 3]);
-    let bytes = each(source.open_places()?, Stage::Bounds, progress, |record| {
-        let mut add = |p: [f64; 3], r: f64| {
-            for a in 0..3 {
-                lo[a] = lo[a].min(p[a] - r);
-                hi[a] = hi[a].max(p[a] + r);
+    let mut add = |p: [f64; 3], r: f64| {
+        for a in 0..3 {
+            lo[a] = lo[a].min(p[a] - r);
+            hi[a] = hi[a].max(p[a] + r);
+        }
+    };
+    let (stream, mut kept) = if most > 0 { (source.open()?, Some(Vec::new())) } else { (source.open_places()?, None) };
+    let mut left = most;
+    let bytes = each(stream, Stage::Bounds, progress, |batch| {
+        for record in batch.iter() {
+            match record {
+                _ if sound(record).is_err() => {}
+                Record::Triangle(t) => t.p.iter().for_each(|p| add(*p, 0.0)),
+                Record::Sphere(s) => add(s.center, s.radius),
             }
-        };
-        match record {
-            _ if sound(record).is_err() => {}
-            Record::Triangle(t) => t.p.iter().for_each(|p| add(*p, 0.0)),
-            Record::Sphere(s) => add(s.center, s.radius),
+        }
+        let bytes = size_of_val(&batch[..]) as u64;
+        match &mut kept {
+            Some(kept) if bytes <= left => {
+                left -= bytes;
+                kept.push(std::mem::take(batch));
+            }
+            _ => kept = None,
         }
         Ok(())
     })?;
-    Ok((lo[0] <= hi[0]).then_some(SourceBounds { lo, hi, bytes }))
+    Ok(Seen { bounds: (lo[0] <= hi[0]).then_some([lo, hi]), bytes, kept })
 }
 
 /// Whether bounds that an importer found can be used.
@@ -120,10 +153,10 @@ pub(crate) fn usable_bounds(bounds: &[[f64; 3]; 2]) -> bool {
     (0..3).all(|a| bounds[0][a] <= bounds[1][a] && bounds[0][a] >= -LARGEST && bounds[1][a] <= LARGEST)
 }
 
-/// The pass that reads every record into the spool.
+/// The pass that takes every record into the spool: those that were kept, else from the source.
 pub(crate) fn ingest(
     description: &Description,
-    source: &dyn RecordSource,
+    (source, kept): (&dyn RecordSource, Option<Vec<Vec<Record>>>),
     offset: [f64; 3],
     settings: &SpoolSettings,
     progress: &dyn PrepareProgress,
@@ -141,7 +174,19 @@ pub(crate) fn ingest(
         glows: Vec::new(),
         hashers: Default::default(),
     };
-    reader.counts.source_bytes = each(source.open()?, Stage::Reading, progress, |record| reader.add(record))?;
+    match kept {
+        Some(kept) => {
+            progress.begin(Stage::Reading, None);
+            for batch in kept {
+                progress.advance(batch.len() as u64);
+                batch.iter().try_for_each(|record| reader.add(record))?;
+            }
+        }
+        None => {
+            let add = |batch: &mut Vec<Record>| batch.iter().try_for_each(|record| reader.add(record));
+            reader.counts.source_bytes = each(source.open()?, Stage::Reading, progress, add)?;
+        }
+    }
     reader.flush()?;
     let mut hasher = blake3::Hasher::new();
     let [always @ .., attributes] = &reader.hashers;

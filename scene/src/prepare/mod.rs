@@ -1,7 +1,8 @@
 //! From a description and its records to a prepared scene: the passes.
 //!
-//! 1. *Bounds*: the source is read for its f64 bounds, unless importing has found them. Their centre becomes the origin.
-//! 2. *Reading*: the source is read once more (at most twice in all). Records are recentred, rounded to f32, checked, and put in a
+//! 1. *Bounds*: the source is read for its f64 bounds, unless importing has found them. Their centre becomes the origin. If its records take at most 64
+//!    MiB they are kept.
+//! 2. *Reading*: else the source is read once more (at most twice in all). Records are recentred, rounded to f32, checked, and put in a
 //!    spool: in memory while they are few, else in a temporary file.
 //!    Textures are read one after the other and stored as tiles.
 //! 3. *Counting*: now the number of splits is known. All candidate grids are counted in one pass over the spool.
@@ -9,7 +10,7 @@
 //!    cells that are copied are dealt to groups.
 //! 5. *Reducing*: groups are joined to new splits, which are built and stored.
 //!
-//! Memory: one batch of the source, the spool's share, the grid tables, and as many splits as there are threads. Every step that runs
+//! Memory: one batch of the source or a small one's records, the spool's share, the grid tables, and as many splits as there are threads. Every step that runs
 //! in parallel is a pure function of one split or one candidate, and results are joined in their order: the bytes do not
 //! depend on threads.
 
@@ -56,7 +57,7 @@ use build::{Blocks, Rayon};
 use building::Building;
 use counting::CountingStore;
 use incidence::{CellBox, ChosenCells};
-use ingest::Ingested;
+use ingest::{Ingested, Seen};
 use spool::Spool;
 
 pub use build::Keep;
@@ -287,7 +288,7 @@ fn passes(
     Ok(Prepared { manifest, reference, reused: false, report }.into())
 }
 
-/// Reads the source: at most twice, the importer's own reading for bounds included.
+/// Reads the source: once if it is small or its bounds are known, else twice; the importer's own reading for bounds included.
 fn read(
     description: &Description,
     source: &dyn RecordSource,
@@ -295,23 +296,22 @@ fn read(
     progress: &dyn PrepareProgress,
 ) -> Result<([f64; 3], Ingested), PrepareError> {
     let known = description.bounds.filter(ingest::usable_bounds);
-    let (lo, hi, bytes) = match known {
-        Some([lo, hi]) => (lo, hi, 0),
-        None => match ingest::bounds(source, progress)? {
-            Some(found) => (found.lo, found.hi, found.bytes),
-            // nothing usable: the pass below counts why
-            None => ([0.0; 3], [0.0; 3], 0),
-        },
+    let Seen { bounds, bytes, kept } = match known {
+        Some(_) => Seen { bounds: known, bytes: 0, kept: None },
+        None => ingest::bounds(source, ingest::to_keep(description), progress)?,
     };
+    // where nothing is usable, what follows counts why
+    let [lo, hi] = bounds.unwrap_or_default();
     let offset = std::array::from_fn(|a| 0.5 * (lo[a] + hi[a]));
-    let mut ingested = ingest::ingest(description, source, offset, spool, progress)?;
+    let again = kept.is_none();
+    let mut ingested = ingest::ingest(description, (source, kept), offset, spool, progress)?;
     let Counts { records, triangles, spheres, degenerate, non_finite, out_of_range, .. } = ingested.counts;
     // lights that were added to a surface are no scene; lights alone that the source has are one
     let meant_dark = description.shapes.iter().any(|s| !ingest::emits(s.emission));
     if triangles + spheres == 0 || (meant_dark && !ingested.has_dark()) {
         return Err(PrepareError::Empty { records, degenerate, non_finite, out_of_range });
     }
-    ingested.counts.source_reads = description.passes + u32::from(known.is_none()) + 1;
+    ingested.counts.source_reads = description.passes + u32::from(known.is_none()) + u32::from(again);
     ingested.counts.source_bytes += bytes + description.bytes_read;
     Ok((offset, ingested))
 }

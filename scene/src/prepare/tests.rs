@@ -161,6 +161,56 @@ fn usable(records: &[Record], manifest: &Manifest) -> BTreeMap<u64, Vec<u32>> {
     out
 }
 
+/// Records that are kept where the bounds are found are those that a second pass reads.
+#[test]
+fn few_records_are_read_once_and_many_twice() {
+    // more than one batch
+    let records = scene(9, 10_000);
+    let size = size_of_val(&records[..]) as u64;
+    let ingested = |most: u64, bounds: Option<[[f64; 3]; 2]>| {
+        let source = List::new(records.clone());
+        let seen = ingest::bounds(&source, most, &NoProgress).unwrap();
+        assert_eq!((seen.kept.is_some(), seen.bytes), (most >= size, 1_000_000), "{most}");
+        let kept = seen.kept.as_ref().map_or(0, |k| k.iter().map(|b| size_of_val(&b[..])).sum::<usize>());
+        assert_eq!(kept as u64, if most >= size { size } else { 0 });
+        assert!(bounds.is_none_or(|b| seen.bounds == Some(b)), "{most}");
+        let bounds = seen.bounds.unwrap();
+        let offset = std::array::from_fn(|a| 0.5 * (bounds[0][a] + bounds[1][a]));
+        let settings = SpoolSettings::default();
+        let from = (&source as &dyn RecordSource, seen.kept);
+        let made = ingest::ingest(&description("list"), from, offset, &settings, &NoProgress).unwrap();
+        let read = source.reads.load(Ordering::Relaxed);
+        (bounds, made.hash, Counts { source_bytes: 0, ..made.counts }, made.counts.source_bytes, read)
+    };
+    let (bounds, hash, counts, bytes, reads) = ingested(0, None);
+    assert_eq!((bytes, reads), (1_000_000, 2));
+    for (most, bytes, reads) in [(1, 1_000_000, 2), (size - 1, 1_000_000, 2), (size, 0, 1), (u64::MAX, 0, 1)] {
+        let found = ingested(most, Some(bounds));
+        assert_eq!(found, (bounds, hash, counts.clone(), bytes, reads), "{most}");
+    }
+}
+
+#[test]
+fn sources_of_large_files_are_read_twice_without_trying() {
+    let folder = tempfile::tempdir().unwrap();
+    let mesh = |name: &str, bytes: u64| {
+        let path = folder.path().join(name);
+        std::fs::File::create(&path).unwrap().set_len(bytes).unwrap();
+        let format = crate::description::MeshFormat::Ply;
+        Geometry::MeshFile { path, format, flip_v: false, smooth: false, attribute: None, parts: None }
+    };
+    let of = |geometry: Vec<Geometry>| {
+        let mut all = description("files");
+        let shape = all.shapes[0].clone();
+        all.shapes.extend(geometry.into_iter().map(|geometry| Shape { geometry, ..shape.clone() }));
+        ingest::to_keep(&all)
+    };
+    assert_eq!(of(vec![]), 64 << 20);
+    assert_eq!(of(vec![mesh("a.ply", 32 << 20), mesh("b.ply", 32 << 20)]), 64 << 20);
+    assert_eq!(of(vec![mesh("a.ply", 32 << 20), mesh("c.ply", (32 << 20) + 1)]), 0);
+    assert_eq!(of(vec![Geometry::IsoSurface { path: folder.path().into(), iso: 0.0 }]), 0);
+}
+
 #[test]
 fn every_primitive_is_where_the_grid_says() {
     for (seed, splits, reduce) in [(1, 1, true), (2, 7, false), (2, 7, true), (3, 23, true), (4, 60, true)] {
@@ -180,7 +230,7 @@ fn every_primitive_is_where_the_grid_says() {
         assert_eq!(counts.triangles + counts.spheres, joined.len() as u64);
         assert_eq!(counts.records, 1500);
         assert_eq!((counts.degenerate, counts.non_finite, counts.out_of_range), (38 + 19, 26, 12));
-        assert_eq!((counts.source_reads, counts.source_bytes), (2, 300_000));
+        assert_eq!((counts.source_reads, counts.source_bytes), (1, 150_000));
 
         let owners: BTreeMap<u32, &CellData> = manifest.grid.cells.iter().map(|c| (c.index, c)).collect();
         let mut contested = BTreeSet::new();
@@ -282,11 +332,11 @@ fn preparing_again_does_nothing_and_says_so() {
     };
     let first = go(&settings(4, true));
     assert!(!first.reused);
-    assert_eq!(source.reads.load(Ordering::Relaxed), 2);
+    assert_eq!(source.reads.load(Ordering::Relaxed), 1);
     let again = go(&settings(4, true));
     assert!(again.reused);
     assert_eq!((again.reference, &again.manifest), (first.reference, &first.manifest));
-    assert_eq!(source.reads.load(Ordering::Relaxed), 2);
+    assert_eq!(source.reads.load(Ordering::Relaxed), 1);
     // without overlap reduction: another scene, made of the same objects but for the copies
     let plain = go(&settings(4, false));
     assert!(!plain.reused);

@@ -1,14 +1,28 @@
 //! Transparent materials and plastics.
 
+use std::collections::BTreeMap;
+
 use super::Converter;
 use super::bsdf::Textures;
 use super::xml::{ObjectId, Value, malformed};
 use crate::ImportError;
-use crate::description::{Bsdf, Slot, Transmittance};
+use crate::description::{Bsdf, Distribution, Slot, Transmittance};
 use crate::import::refraction;
 
 /// Largest ratio of indices; diamond in vacuum has 2.4, and beyond 10 the reflectance of diffuse light is not known well enough.
 const LARGEST: f64 = 10.0;
+
+/// Transmittances that were asked for, by whether it is GGX's, and the bits of alpha and eta: of a scene's rough plastics most are alike, and each takes
+/// some 20 ms.
+#[derive(Default)]
+pub(super) struct Coats(BTreeMap<(bool, u32, u32), Transmittance>);
+
+impl Coats {
+    fn get(&mut self, distribution: Distribution, alpha: f32, eta: f32) -> Transmittance {
+        let asked = (distribution == Distribution::Ggx, alpha.to_bits(), eta.to_bits());
+        self.0.entry(asked).or_insert_with(|| Transmittance::new(distribution, alpha, eta)).clone()
+    }
+}
 
 impl Converter<'_> {
     /// `dielectric`, `thindielectric` and `roughdielectric`.
@@ -63,7 +77,7 @@ impl Converter<'_> {
             self.unsupported(place, "a texture for the alpha of a roughplastic", "0.1");
         }
         self.ignore(id, &["sample_visible"]);
-        let coat = Transmittance::new(distribution, alpha, eta);
+        let coat = self.coats.get(distribution, alpha, eta);
         Ok(Bsdf::RoughPlastic { distribution, alpha, eta, diffuse, specular, nonlinear, coat })
     }
 

@@ -31,6 +31,7 @@ mod xml;
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
+use self::coats::Coats;
 use self::xml::{Document, ObjectId, Property, Value, malformed};
 use super::ImportOptions;
 use crate::ImportError;
@@ -46,6 +47,7 @@ pub(super) fn import(path: &Path, options: &ImportOptions) -> Result<Description
         unsupported: vec![],
         materials: BTreeMap::new(),
         textures: BTreeMap::new(),
+        coats: Coats::default(),
         open: BTreeSet::new(),
         entered: 0,
     };
@@ -80,6 +82,7 @@ struct Converter<'a> {
     materials: BTreeMap<ObjectId, u32>,
     /// Textures made so far, by object; none for one that cannot be had.
     textures: BTreeMap<ObjectId, Option<u32>>,
+    coats: Coats,
     /// Objects being converted, to find cycles of references.
     open: BTreeSet<ObjectId>,
     /// Objects begun so far.
