@@ -40,11 +40,11 @@ fn materials_of_a_mesh_are_told() {
     fs::write(folder.path().join("a.mtl"), library).unwrap();
     let run = check(&["a.obj"]);
     assert_eq!(run.code, 2, "{}", run.err);
-    assert!(run.err.contains("a.mtl:7: disp in a material library is not supported"), "{}", run.err);
+    assert!(run.err.contains("a.mtl:7:1: disp in a material library is not supported"), "{}", run.err);
     assert_eq!(run.err.matches("ka is passed over").count(), 1, "once for each library: {}", run.err);
     assert!(run.out.contains("1 obj, 2 part of an obj"), "{}", run.out);
     let run = check(&["a.obj", "--substitute"]);
-    assert!(run.code == 0 && run.err.contains("a.mtl:3: ka is passed over"), "{}", run.err);
+    assert!(run.code == 0 && run.err.contains("a.mtl:3:1: ka is passed over"), "{}", run.err);
 
     // a scene around it has materials of its own
     let scene = "<scene version='3.0.0'><shape type='obj'><string name='filename' value='a.obj'/></shape>\

@@ -32,6 +32,10 @@ impl Place {
     pub fn line(path: impl Into<PathBuf>, line: u32) -> Self {
         Place { file: path.into(), line, column: 0 }
     }
+    /// Where in its line something begins, `at` bytes after its start.
+    pub fn at(self, at: usize) -> Self {
+        Place { column: u32::try_from(at + 1).unwrap_or(0), ..self }
+    }
 }
 
 impl std::fmt::Display for Place {

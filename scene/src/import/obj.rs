@@ -8,7 +8,7 @@ use bytemuck::{Pod, Zeroable};
 
 use super::mesh::{Corners, Positions, TriangleReader, budget};
 use super::number::{Number, number};
-use super::source::{Source, show};
+use super::source::{Source, Words, show};
 use super::spill::{Budget, Column};
 use super::stream::StreamOptions;
 use crate::ImportError;
@@ -32,6 +32,8 @@ pub(super) struct ObjReader {
     polygon: Vec<Corner>,
     fanned: usize,
     line: Vec<u8>,
+    /// Whether the line is several of the file's.
+    continued: bool,
     /// Whether anything was read that an OBJ file has.
     recognized: bool,
     parts: Option<PartNumbers>,
@@ -127,6 +129,7 @@ impl ObjReader {
             polygon: vec![],
             fanned: 0,
             line: vec![],
+            continued: false,
             recognized: false,
             parts: parts.map(numbers),
             part: 0,
@@ -163,6 +166,7 @@ impl ObjReader {
     /// Reads a line with its continuations into `self.line`; false at the end.
     fn read_line(&mut self) -> Result<bool, ImportError> {
         self.line.clear();
+        self.continued = false;
         loop {
             let Some(part) = self.source.line_bytes()? else { return Ok(!self.line.is_empty()) };
             let Some(part) = part.strip_suffix(b"\\") else {
@@ -171,6 +175,7 @@ impl ObjReader {
             };
             self.line.extend_from_slice(part);
             self.line.push(b' ');
+            self.continued = true;
             if self.line.len() > MAX_LINE {
                 return self.source.fail_line(format!("a line longer than {MAX_LINE} bytes with its continuations"));
             }
@@ -181,7 +186,7 @@ impl ObjReader {
     fn next_polygon(&mut self) -> Result<bool, ImportError> {
         while self.read_line()? {
             let line = std::mem::take(&mut self.line);
-            let mut words = line.split(|b| b.is_ascii_whitespace()).filter(|w| !w.is_empty());
+            let mut words = Words::new(&line);
             let keyword = words.next().unwrap_or(b"");
             let is_face = keyword == b"f";
             match keyword {
@@ -208,7 +213,7 @@ impl ObjReader {
         Ok(false)
     }
 
-    fn vertex<'w>(&mut self, words: impl Iterator<Item = &'w [u8]>) -> Result<(), ImportError> {
+    fn vertex(&mut self, words: Words) -> Result<(), ImportError> {
         let p = self.numbers::<f64, 3>(words, "v", 3)?;
         match &mut self.positions {
             Positions::Double(column) => column.push(p, &mut self.budget).map_err(|e| self.source.io(e)),
@@ -216,20 +221,25 @@ impl ObjReader {
         }
     }
 
-    fn texture_coordinate<'w>(&mut self, words: impl Iterator<Item = &'w [u8]>) -> Result<(), ImportError> {
+    fn texture_coordinate(&mut self, words: Words) -> Result<(), ImportError> {
         let uv = self.numbers::<f32, 2>(words, "vt", 1)?;
         self.uv.push(uv, &mut self.budget).map_err(|e| self.source.io(e))
     }
 
-    fn normal<'w>(&mut self, words: impl Iterator<Item = &'w [u8]>) -> Result<(), ImportError> {
+    fn normal(&mut self, words: Words) -> Result<(), ImportError> {
         let n = self.numbers::<f32, 3>(words, "vn", 3)?;
         self.normals.push(n, &mut self.budget).map_err(|e| self.source.io(e))
     }
 
+    /// An error at the last word.
+    fn fail_word<T>(&self, words: &Words, message: String) -> Result<T, ImportError> {
+        if self.continued { self.source.fail_line(message) } else { self.source.fail_at(words.at(), message) }
+    }
+
     /// The first `N` numbers of a line, of which `least` must be there (others are 0).
-    fn numbers<'w, T: Number + Default + Copy, const N: usize>(
+    fn numbers<T: Number + Default + Copy, const N: usize>(
         &self,
-        mut words: impl Iterator<Item = &'w [u8]>,
+        mut words: Words,
         keyword: &str,
         least: usize,
     ) -> Result<[T; N], ImportError> {
@@ -240,8 +250,7 @@ impl ObjReader {
                     Some(value) => *slot = value,
                     None => {
                         return self
-                            .source
-                            .fail_line(format!("\"{}\" where a number of {keyword} should be", show(word)));
+                            .fail_word(&words, format!("\"{}\" where a number of {keyword} should be", show(word)));
                     }
                 },
                 None if i < least => return self.source.fail_line(format!("{keyword} needs {least} number(s)")),
@@ -252,9 +261,9 @@ impl ObjReader {
     }
 
     /// Fills `self.polygon`.
-    fn face<'w>(&mut self, words: impl Iterator<Item = &'w [u8]>) -> Result<(), ImportError> {
+    fn face(&mut self, mut words: Words) -> Result<(), ImportError> {
         self.polygon.clear();
-        for word in words {
+        while let Some(word) = words.next() {
             if word[0] == b'#' {
                 break;
             }
@@ -262,13 +271,12 @@ impl ObjReader {
             let mut parts = word.split(|b| *b == b'/');
             for (k, slot) in corner.iter_mut().enumerate() {
                 if let Some(part) = parts.next().filter(|p| !p.is_empty()) {
-                    *slot = self.index(part, k, word)?;
+                    *slot = self.index(part, k, &words, word)?;
                 }
             }
             if corner[0] == NONE || parts.next().is_some() {
-                return self
-                    .source
-                    .fail_line(format!("\"{}\" is no corner of the form v, v/vt, v//vn or v/vt/vn", show(word)));
+                let message = format!("\"{}\" is no corner of the form v, v/vt, v//vn or v/vt/vn", show(word));
+                return self.fail_word(&words, message);
             }
             self.polygon.push(corner);
         }
@@ -276,9 +284,9 @@ impl ObjReader {
     }
 
     /// A number from 1, or from -1 backwards, as a place in the array of `v`, `vt` or `vn`.
-    fn index(&self, part: &[u8], kind: usize, word: &[u8]) -> Result<u32, ImportError> {
+    fn index(&self, part: &[u8], kind: usize, words: &Words, word: &[u8]) -> Result<u32, ImportError> {
         let Some(value) = number::<i64>(part) else {
-            return self.source.fail_line(format!("\"{}\" where a corner of a face should be", show(word)));
+            return self.fail_word(words, format!("\"{}\" where a corner of a face should be", show(word)));
         };
         let seen = [self.positions.len(), self.uv.len(), self.normals.len()][kind] as i64;
         let index = if value < 0 { seen.checked_add(value) } else { value.checked_sub(1) };
@@ -289,7 +297,7 @@ impl ObjReader {
                 .fail_limit(format!("more than {NONE} of one kind of vertex: cut the mesh into several files")),
             _ => {
                 let name = ["v", "vt", "vn"][kind];
-                self.source.fail_line(format!("index {value} of {name}, but {seen} of them stand above"))
+                self.fail_word(words, format!("index {value} of {name}, but {seen} of them stand above"))
             }
         }
     }

@@ -358,7 +358,7 @@ fn scalar(source: &mut Source, format: Format, kind: Kind) -> Result<f64, Import
         Some(value) => Ok(value),
         None => {
             let word = show(token);
-            source.fail_line(format!("\"{word}\" where a number should be"))
+            source.fail_word(format!("\"{word}\" where a number should be"))
         }
     }
 }
@@ -373,7 +373,7 @@ fn integer(source: &mut Source, format: Format, kind: Kind) -> Result<i64, Impor
         Some(value) => Ok(value),
         None => {
             let word = show(token);
-            source.fail_line(format!("\"{word}\" where a whole number should be"))
+            source.fail_word(format!("\"{word}\" where a whole number should be"))
         }
     }
 }

@@ -31,6 +31,9 @@ pub(super) struct Source {
     offset: u64,
     /// Line of the last word or line read, from 1.
     line: u32,
+    /// Offsets of that line, and of the last word read.
+    line_start: u64,
+    word_start: u64,
     file_length: u64,
     /// Bytes read at a time.
     chunk: usize,
@@ -80,6 +83,8 @@ impl Source {
             end,
             offset: 0,
             line: 0,
+            line_start: 0,
+            word_start: 0,
             file_length: metadata.len(),
             chunk: BUFFER,
         })
@@ -145,6 +150,17 @@ impl Source {
     /// An error at the last line read.
     pub fn fail_line<T>(&self, message: impl Into<String>) -> Result<T, ImportError> {
         let place = Place::line(&self.path, self.line.max(1));
+        Err(ImportError::Malformed { place, message: message.into() })
+    }
+
+    /// An error at the last word read.
+    pub fn fail_word<T>(&self, message: impl Into<String>) -> Result<T, ImportError> {
+        self.fail_at(self.word_start.saturating_sub(self.line_start) as usize, message)
+    }
+
+    /// An error so many bytes after the start of the last line read.
+    pub fn fail_at<T>(&self, at: usize, message: impl Into<String>) -> Result<T, ImportError> {
+        let place = Place::line(&self.path, self.line.max(1)).at(at);
         Err(ImportError::Malformed { place, message: message.into() })
     }
 
@@ -233,6 +249,7 @@ impl Source {
 
     /// The next line without its end (`\n` or `\r\n`); none at the end of the file.
     pub fn line_bytes(&mut self) -> Result<Option<&[u8]>, ImportError> {
+        self.line_start = self.offset;
         let mut searched = 0;
         let length = loop {
             match self.buffer[self.start + searched..self.end].iter().position(|b| *b == b'\n') {
@@ -268,17 +285,22 @@ impl Source {
     pub fn token(&mut self) -> Result<Option<&[u8]>, ImportError> {
         // nearly every word lies in the buffer with what ends it
         let have = &self.buffer[self.start..self.end];
-        let (mut first, mut lines) = (0, 0);
+        let (mut first, mut lines, mut begins) = (0, 0, 0);
         while first < have.len() && is_blank(have[first]) {
-            lines += u32::from(have[first] == b'\n');
+            if have[first] == b'\n' {
+                (lines, begins) = (lines + 1, first + 1);
+            }
             first += 1;
         }
         let mut after = first;
         while after < have.len() && !is_blank(have[after]) {
             after += 1;
         }
-        self.line += lines;
+        if lines > 0 {
+            (self.line, self.line_start) = (self.line + lines, self.offset + begins as u64);
+        }
         self.pass(first);
+        self.word_start = self.offset;
         if self.start + (after - first) < self.end && after - first <= MAX_TOKEN {
             let at = self.start;
             self.pass(after - first);
@@ -301,9 +323,12 @@ impl Source {
             if !is_blank(byte) {
                 break;
             }
-            self.line += u32::from(byte == b'\n');
             self.pass(1);
+            if byte == b'\n' {
+                (self.line, self.line_start) = (self.line + 1, self.offset);
+            }
         }
+        self.word_start = self.offset;
         let mut length = 1;
         loop {
             let have = &self.buffer[self.start..self.end];
@@ -327,7 +352,7 @@ impl Source {
         }
         if length > MAX_TOKEN {
             return self
-                .fail_line(format!("a word longer than {MAX_TOKEN} bytes: this is no text file of this format"));
+                .fail_word(format!("a word longer than {MAX_TOKEN} bytes: this is no text file of this format"));
         }
         let at = self.start;
         self.pass(length);
@@ -354,6 +379,39 @@ impl Source {
     /// After reading lines, before reading words: we are in the line after the last one read.
     pub fn begin_tokens(&mut self) {
         self.line += 1;
+        self.line_start = self.offset;
+    }
+}
+
+/// The words of a line, which white space is between.
+pub(super) struct Words<'l> {
+    rest: &'l [u8],
+    length: usize,
+    at: usize,
+}
+
+impl<'l> Words<'l> {
+    pub fn new(line: &'l [u8]) -> Self {
+        Words { rest: line, length: line.len(), at: 0 }
+    }
+
+    /// How many bytes of the line stand before the last word.
+    pub fn at(&self) -> usize {
+        self.at
+    }
+}
+
+impl<'l> Iterator for Words<'l> {
+    type Item = &'l [u8];
+
+    #[inline]
+    fn next(&mut self) -> Option<&'l [u8]> {
+        let first = self.rest.iter().position(|b| !is_blank(*b))?;
+        let rest = &self.rest[first..];
+        self.at = self.length - rest.len();
+        let (word, rest) = rest.split_at(rest.iter().position(|b| is_blank(*b)).unwrap_or(rest.len()));
+        self.rest = rest;
+        Some(word)
     }
 }
 

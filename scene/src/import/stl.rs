@@ -155,7 +155,7 @@ impl StlReader {
                 }
                 other => {
                     let word = show(other);
-                    return self.source.fail_line(format!("\"{word}\" is no word of STL"));
+                    return self.source.fail_word(format!("\"{word}\" is no word of STL"));
                 }
             }
         }
@@ -167,7 +167,7 @@ impl StlReader {
                 Some(value) => Ok(value.into()),
                 None => {
                     let word = show(word);
-                    self.source.fail_line(format!("\"{word}\" where a number should be"))
+                    self.source.fail_word(format!("\"{word}\" where a number should be"))
                 }
             },
             None => self.source.fail_line("the file ends in the middle of a facet: it is truncated, get it again"),

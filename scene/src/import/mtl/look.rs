@@ -97,10 +97,12 @@ impl Libraries<'_> {
                 said.index = Some(index);
             }
             "d" => {
-                let mut plain = Statement { rest: s.rest.clone(), keyword: "d".into(), place: s.place.clone() };
+                let mut plain =
+                    Statement { rest: s.rest.clone(), keyword: "d".into(), place: s.place.clone(), rest_at: s.rest_at };
                 if let Some(rest) = s.rest.strip_prefix("-halo") {
                     self.unsupported(&s.place, "d -halo (opacity by angle)", "the same opacity from everywhere");
                     plain.rest = rest.trim().into();
+                    plain.rest_at += s.rest.len() - plain.rest.len();
                 }
                 said.opacity = Some(self.at_most(&plain, 1.0)?);
             }

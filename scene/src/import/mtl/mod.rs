@@ -124,17 +124,20 @@ fn entries(path: &Path, bytes_read: &mut u64) -> Result<Vec<Entry>, ImportError>
     let mut source = Source::open(path)?;
     let mut out: Vec<Entry> = vec![];
     while let Some(line) = source.line_bytes()? {
-        let text = String::from_utf8_lossy(line).trim().to_owned();
+        let line = String::from_utf8_lossy(line).into_owned();
+        let text = line.trim();
         if text.is_empty() || text.starts_with('#') {
             continue;
         }
-        let (file, line) = source.place();
-        let place = Place::line(file, line);
-        let (keyword, rest) = text.split_once(|c: char| c.is_ascii_whitespace()).unwrap_or((&text, ""));
+        let (file, number) = source.place();
+        let (keyword, rest) = text.split_once(|c: char| c.is_ascii_whitespace()).unwrap_or((text, ""));
         let rest = rest.trim();
+        // what is left when what stands at the end is taken away
+        let at = |part: &str| line.trim_end().len() - part.len();
+        let (place, rest_at) = (Place::line(file, number).at(at(text)), at(rest));
         if keyword.eq_ignore_ascii_case("newmtl") {
             if rest.is_empty() {
-                return source.fail_line("newmtl needs a name");
+                return source.fail_at(at(text), "newmtl needs a name");
             }
             if out.len() == MAX_MATERIALS {
                 return source.fail_limit(format!("more than {MAX_MATERIALS} materials in one library"));
@@ -143,15 +146,14 @@ fn entries(path: &Path, bytes_read: &mut u64) -> Result<Vec<Entry>, ImportError>
             continue;
         }
         let Some(entry) = out.last_mut() else {
-            return source.fail_line(format!(
-                "\"{}\" before the first newmtl: this is no material library",
-                super::source::show(keyword.as_bytes())
-            ));
+            let keyword = super::source::show(keyword.as_bytes());
+            let message = format!("\"{keyword}\" before the first newmtl: this is no material library");
+            return source.fail_at(at(text), message);
         };
         if entry.statements.len() == MAX_STATEMENTS {
             return source.fail_limit(format!("more than {MAX_STATEMENTS} statements in one material"));
         }
-        entry.statements.push(Statement { keyword: keyword.to_ascii_lowercase(), rest: rest.into(), place });
+        entry.statements.push(Statement { keyword: keyword.to_ascii_lowercase(), rest: rest.into(), place, rest_at });
     }
     *bytes_read += source.bytes_read();
     Ok(out)

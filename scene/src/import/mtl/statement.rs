@@ -1,5 +1,6 @@
 //! One statement of a material: its numbers, its colour, its map.
 
+use super::super::source::{Words, show};
 use crate::ImportError;
 use crate::description::{Place, UvMap, Wrap};
 
@@ -8,7 +9,9 @@ pub(super) struct Statement {
     /// In small letters: exporters do not agree on them.
     pub keyword: String,
     pub rest: String,
+    /// Of the keyword; and how many bytes after the start of its line the rest begins.
     pub place: Place,
+    pub rest_at: usize,
 }
 
 /// What a map statement says.
@@ -27,49 +30,60 @@ impl Statement {
         Err(ImportError::Malformed { place: self.place.clone(), message: format!("{}: {message}", self.keyword) })
     }
 
-    /// Its only number.
-    pub fn number(&self) -> Result<f64, ImportError> {
-        self.parse(self.rest.trim())
+    /// An error so many bytes after the start of the rest.
+    fn fail_at<T>(&self, at: usize, message: impl std::fmt::Display) -> Result<T, ImportError> {
+        let place = self.place.clone().at(self.rest_at + at);
+        Err(ImportError::Malformed { place, message: format!("{}: {message}", self.keyword) })
     }
 
-    fn parse(&self, word: &str) -> Result<f64, ImportError> {
+    /// The words of the rest, and how many bytes stand before each.
+    fn words(&self) -> Vec<(usize, &str)> {
+        let mut words = Words::new(self.rest.as_bytes());
+        let mut out = Vec::new();
+        while let Some(word) = words.next() {
+            out.push((words.at(), &self.rest[words.at()..words.at() + word.len()]));
+        }
+        out
+    }
+
+    fn parse(&self, (at, word): (usize, &str)) -> Result<f64, ImportError> {
         match word.parse::<f64>() {
             Ok(x) if x.is_finite() => Ok(x),
-            _ => self.fail(format_args!("\"{}\" is no finite number", super::super::source::show(word.as_bytes()))),
+            _ => self.fail_at(at, format_args!("\"{}\" is no finite number", show(word.as_bytes()))),
         }
     }
 
-    /// A number of at least 0.
+    fn parse_positive(&self, word: (usize, &str)) -> Result<f64, ImportError> {
+        let x = self.parse(word)?;
+        if x < 0.0 { self.fail_at(word.0, format_args!("{x} should not be negative")) } else { Ok(x) }
+    }
+
+    /// Its only number, of at least 0.
     pub fn positive(&self) -> Result<f64, ImportError> {
-        let x = self.number()?;
-        if x < 0.0 { self.fail(format_args!("{x} should not be negative")) } else { Ok(x) }
+        self.parse_positive((0, &self.rest))
     }
 
     /// One number (grey) or three of at least 0, linear; `None` of a spectrum or of CIE XYZ, which are not read.
     pub fn color(&self) -> Result<Option<[f64; 3]>, ImportError> {
-        let words: Vec<&str> = self.rest.split_ascii_whitespace().collect();
-        let rgb = match words[..] {
-            ["spectral" | "xyz", ..] => return Ok(None),
-            [v] => [self.parse(v)?; 3],
-            [r, g, b] => [self.parse(r)?, self.parse(g)?, self.parse(b)?],
-            _ => return self.fail(format_args!("{} numbers instead of one or three", words.len())),
-        };
-        match rgb.iter().find(|x| **x < 0.0) {
-            Some(x) => self.fail(format_args!("{x} should not be negative")),
-            None => Ok(Some(rgb)),
+        let words = self.words();
+        match words[..] {
+            [(_, "spectral" | "xyz"), ..] => Ok(None),
+            [v] => Ok(Some([self.parse_positive(v)?; 3])),
+            [r, g, b] => Ok(Some([self.parse_positive(r)?, self.parse_positive(g)?, self.parse_positive(b)?])),
+            _ => self.fail_at(0, format_args!("{} numbers instead of one or three", words.len())),
         }
     }
 
     /// A file with options before it.
     pub fn map(&self) -> Result<Map, ImportError> {
-        let words: Vec<&str> = self.rest.split_ascii_whitespace().collect();
+        let words = self.words();
         let (mut scale, mut offset, mut turbulence) = ([1.0; 3], [0.0; 3], [0.0; 3]);
         let mut map =
             Map { file: String::new(), to_uv: UvMap::IDENTITY, wrap: Wrap::Repeat, bump: 1.0, unread: Vec::new() };
         let mut at = 0;
-        while let Some(option) = words.get(at).filter(|w| w.starts_with('-') && at + 1 < words.len()) {
+        while let Some(option) = words.get(at).filter(|(_, w)| w.starts_with('-') && at + 1 < words.len()) {
             at += 1;
-            match *option {
+            match option.1 {
                 "-s" => at += self.up_to_three(&words[at..], &mut scale)?,
                 "-o" => at += self.up_to_three(&words[at..], &mut offset)?,
                 "-t" => at += self.up_to_three(&words[at..], &mut turbulence)?,
@@ -78,7 +92,7 @@ impl Statement {
                     at += 1;
                 }
                 "-clamp" => {
-                    map.wrap = if words[at].eq_ignore_ascii_case("on") { Wrap::Clamp } else { Wrap::Repeat };
+                    map.wrap = if words[at].1.eq_ignore_ascii_case("on") { Wrap::Clamp } else { Wrap::Repeat };
                     at += 1;
                 }
                 "-mm" => {
@@ -90,17 +104,19 @@ impl Statement {
                 }
                 "-imfchan" => {
                     // luminance is what a number of a colour is anyway
-                    if words[at] != "l" {
-                        map.unread.push(format!("-imfchan {}", words[at]));
+                    if words[at].1 != "l" {
+                        map.unread.push(format!("-imfchan {}", words[at].1));
                     }
                     at += 1;
                 }
                 // how a texture is filtered or kept, or colour correction of other programs
                 "-blendu" | "-blendv" | "-boost" | "-cc" | "-texres" | "-colorspace" | "-type" => at += 1,
-                other => return self.fail(format_args!("no option {other} is known; see docs/formats.md")),
+                other => {
+                    return self.fail_at(option.0, format_args!("no option {other} is known; see docs/formats.md"));
+                }
             }
         }
-        map.file = words[at..].join(" ");
+        map.file = words[at..].iter().map(|(_, word)| *word).collect::<Vec<_>>().join(" ");
         if map.file.is_empty() {
             return self.fail("it names no file");
         }
@@ -114,15 +130,16 @@ impl Statement {
     }
 
     /// Reads one to three numbers into the first of `out`; how many there were.
-    fn up_to_three(&self, words: &[&str], out: &mut [f64; 3]) -> Result<usize, ImportError> {
+    fn up_to_three(&self, words: &[(usize, &str)], out: &mut [f64; 3]) -> Result<usize, ImportError> {
         let mut n = 0;
         for (slot, word) in out.iter_mut().zip(words) {
-            match word.parse::<f64>() {
-                Ok(_) => *slot = self.parse(word)?,
+            match word.1.parse::<f64>() {
+                Ok(_) => *slot = self.parse(*word)?,
                 Err(_) => break,
             }
             n += 1;
         }
-        if n == 0 { self.fail("an option lacks its numbers") } else { Ok(n) }
+        let at = words.first().map_or(0, |(at, _)| *at);
+        if n == 0 { self.fail_at(at, "an option lacks its numbers") } else { Ok(n) }
     }
 }

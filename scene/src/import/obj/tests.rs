@@ -37,11 +37,11 @@ fn smoothing_changes_only_normals() {
 }
 
 #[test]
-fn errors_name_the_line() {
+fn errors_name_the_place() {
     let dir = folder();
     let head = "v 0 0 0\nv 1 0 0\nv 0 1 0\n";
     for (line, what) in [
-        ("f 1 2 4", "a.obj:4: index 4 of v, but 3"),
+        ("f 1 2 4", "a.obj:4:7: index 4 of v, but 3"),
         ("f 1 2 0", "index 0"),
         ("f 1 2 -4", "index -4"),
         ("f 1 2 9223372036854775807", "index 9223372036854775807"),
@@ -49,11 +49,13 @@ fn errors_name_the_line() {
         ("f 1 2 3/1", "index 1 of vt, but 0"),
         ("f 1 2 3//1", "index 1 of vn, but 0"),
         ("f 1 2 3/1/1/1", "index 1 of vt"),
-        ("f a b c", "\"a\" where a corner"),
+        ("f a b c", "a.obj:4:3: \"a\" where a corner"),
         ("f /1 2 3", "index 1 of vt"),
-        ("f / 2 3", "no corner of the form"),
-        ("v 1 2", "v needs 3"),
-        ("v 1 2 x", "\"x\" where a number of v"),
+        ("\tf / 2 3", "a.obj:4:4: \"/\" is no corner of the form"),
+        ("v 1 2", "a.obj:4: v needs 3"),
+        ("v 1  2 x", "a.obj:4:8: \"x\" where a number of v"),
+        // of a line that goes on in another the column would be that of neither
+        ("v 1 \\\n2 x", "a.obj:5: \"x\" where a number of v"),
     ] {
         let error =
             triangles(&write(&dir, "a.obj", format!("{head}{line}\n")), MeshFormat::Obj).unwrap_err().to_string();

@@ -43,14 +43,14 @@ fn errors_name_the_place() {
         (binary(1, &one)[..100].to_vec(), "hold 0"),
         (vec![0; 10], "too short"),
         (vec![], "too short"),
-        (ASCII.into(), "a.stl:11: \"FACET\" is no word"),
+        (ASCII.into(), "a.stl:11:1: \"FACET\" is no word"),
         (b"solid x\n".to_vec(), "no facet"),
         (b"solid x\nfacet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0".to_vec(), "truncated"),
         (
             b"solid x\nfacet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nendloop".to_vec(),
             "a.stl:6: a loop of 2",
         ),
-        (b"solid x\nfacet normal 0 0 up\n".to_vec(), "\"up\" where a number"),
+        (b"solid x\nfacet normal 0 0 up\n".to_vec(), "a.stl:2:18: \"up\" where a number"),
     ];
     for (bytes, what) in cases {
         let error = triangles(&write(&dir, "a.stl", bytes), MeshFormat::Stl).unwrap_err().to_string();
