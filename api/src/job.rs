@@ -301,7 +301,7 @@ pub struct SamplingSpec {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[schemars(range(min = 1, max = 65535))]
     pub max_depth: Option<i32>,
-    /// Vertex from which Russian roulette ends paths.
+    /// Vertex from which Russian roulette ends paths; the scene's, or 3.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[schemars(range(min = 1, max = 65535))]
     pub rr_depth: Option<i32>,

@@ -29,7 +29,7 @@ pub struct ImageOptions {
     /// Most rays in a path, shadow rays not counted: 1 sees emitters only [default: the scene's, or 65]
     #[arg(long, value_name = "N", allow_hyphen_values = true)]
     pub max_depth: Option<i32>,
-    /// Vertex from which Russian roulette ends paths [default: the scene's, or 5]
+    /// Vertex from which Russian roulette ends paths [default: the scene's, or 3]
     #[arg(long, value_name = "N", allow_hyphen_values = true)]
     pub rr_depth: Option<i32>,
     /// Paths that go on from the first hit of each sample [default: 1]

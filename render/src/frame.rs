@@ -21,7 +21,7 @@ pub struct Frame {
     pub seed: u64,
     /// Most rays of a path but shadow rays, at least 1: 1 sees emitters only (Mitsuba's `max_depth`), below 65536.
     pub max_depth: u32,
-    /// Ray number from which Russian roulette may end a path (Mitsuba's `rr_depth`).
+    /// Ray number from which Russian roulette may end a path (Mitsuba's `rr_depth`), with the chances of [`crate::path::shade`].
     pub rr_depth: u32,
     /// Continuations at the first hit (the paper's N_d); 1 is none.
     pub split: u32,

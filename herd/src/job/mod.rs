@@ -8,5 +8,5 @@ pub mod spec;
 
 pub use error::JobError;
 pub use progress::{Image, Progress, Silent, Status};
-pub use scene::PreparedScene;
+pub use scene::{PICTURE, PreparedScene};
 pub use settings::{Commits, JobSettings, NodeSpec, Sampling};

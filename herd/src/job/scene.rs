@@ -18,6 +18,9 @@ use super::JobError;
 use crate::plan::place;
 use crate::resident::top_bytes;
 
+/// Changes whenever another picture is made of the same scene and frame: no run goes on with another program's film, and no worker adds to it.
+pub const PICTURE: u32 = 4;
+
 /// A prepared scene with its small parts in memory: world, lights, grid. Blocks stay in the store.
 pub struct PreparedScene {
     /// What it is made of.
@@ -136,8 +139,7 @@ impl PreparedScene {
     pub fn image_name(&self, frame: &Frame) -> Result<String, JobError> {
         let frame = serde_json::to_vec(frame).map_err(|e| JobError::Internal(e.to_string()))?;
         let mut hasher = blake3::Hasher::new();
-        // the number changes whenever another picture is made of the same scene and frame: no run goes on with another program's film
-        hasher.update(b"rayherd image 3\0").update(&self.manifest.content.0).update(&frame);
+        hasher.update(format!("rayherd image {PICTURE}\0").as_bytes()).update(&self.manifest.content.0).update(&frame);
         if !self.skips.makes(Skip::Lights) {
             hasher.update(b"\0every light");
         }

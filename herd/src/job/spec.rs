@@ -17,8 +17,8 @@ use super::JobError;
 const DEFAULT_SIZE: [u32; 2] = [768, 576];
 /// Enough for every scene that ends paths by Russian roulette.
 const DEFAULT_MAX_DEPTH: u32 = 65;
-/// Mitsuba's.
-const DEFAULT_RR_DEPTH: u32 = 5;
+/// The least CPU to an error in most scenes (docs/benchmarks/tried.md); Mitsuba, whose chances are others, begins at 5.
+const DEFAULT_RR_DEPTH: u32 = 3;
 /// Enough to see what is what.
 const DEFAULT_SPP: u32 = 64;
 

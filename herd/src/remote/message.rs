@@ -47,6 +47,9 @@ pub struct Poll {
     /// It makes pictures of films that are not finished.
     #[serde(default)]
     pub previews: bool,
+    /// Which picture it makes of a scene and frame ([`crate::job::PICTURE`]); that of a worker that does not say so is another.
+    #[serde(default)]
+    pub picture: u32,
     /// What its cache holds of the stage's scene, if it has one.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub holds: Option<Holds>,

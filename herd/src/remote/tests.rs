@@ -29,7 +29,7 @@ use super::message::{Answer, Beat, Poll, Report, WorkerId};
 use super::preparing::APART;
 use super::{Depot, Fleet, Link, LinkError, Station, Turns};
 use crate::driver::{Event, Executor};
-use crate::job::{JobError, JobSettings, PreparedScene, Sampling, Silent, spec as from_spec};
+use crate::job::{JobError, JobSettings, PICTURE, PreparedScene, Sampling, Silent, spec as from_spec};
 use crate::local::{journal, render_local};
 use crate::profile::Part;
 use crate::report;
@@ -320,6 +320,7 @@ pub(super) fn poll(number: u32, session: &str) -> Poll {
         aovs: true,
         builds: true,
         previews: true,
+        picture: PICTURE,
         holds: None,
     }
 }

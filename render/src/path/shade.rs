@@ -20,8 +20,8 @@ use crate::world::{Primitive, ShapeInfo};
 /// `rays` and `hits` are of one length. A ray that missed brings the sky. A hit brings what the surface emits, and unless the path ends there (depth,
 /// roulette, nothing reflected), a shadow ray to a light and a next ray; at the first hit `frame.split` of each.
 ///
-/// Depth and roulette are Mitsuba's, so that equal settings mean equal work: a path has at most `max_depth` rays; after ray number `rr_depth`
-/// and later ones it goes on with probability min(largest channel of the throughput, 0.95).
+/// Depth is Mitsuba's: a path has at most `max_depth` rays. After ray number `rr_depth` and later ones it goes on with probability min(w, 0.95), where w is the
+/// largest channel of its throughput over that before the vertex (Mitsuba's is the largest channel itself; see `vertex::survive`).
 pub fn shade<S: Surfaces>(context: &Context, surfaces: &S, rays: &[PathRay], hits: &[Hit], out: &mut Outcome) {
     let mut traced = std::mem::take(&mut out.rays);
     traced.clear();
@@ -355,7 +355,6 @@ pub(super) fn scatter_plain(
     let roulette = u32::from(next_key.vertex) >= frame.rr_depth;
     let direction = [unit(numbers[BSDF]), unit(numbers[BSDF + 1])];
     let go_on = unit(numbers[ROULETTE]);
-    let siblings = frame.split as f32;
 
     let place = [numbers[LIGHT], numbers[LIGHT + 1]];
     let facing = if bsdf.transmits() { Facing::ANY } else { Facing::front(at.shading) };
@@ -394,8 +393,7 @@ pub(super) fn scatter_plain(
         let (d, above) = cosine_direction(at.shading, direction);
         let (dir, wi) = snap(d);
         let left = reflectance * at.terminator(wi);
-        let (throughput, pdf, fate) =
-            onwards(throughput, left, at.normal, at.shading, wi, above, go_on, roulette, siblings);
+        let (throughput, pdf, fate) = onwards(throughput, left, at.normal, at.shading, wi, above, go_on, roulette);
         (origin, dir, throughput, pdf, fate)
     } else {
         let basis = at.basis(surface, bsdf.is_anisotropic());
@@ -463,7 +461,7 @@ pub(super) fn scatter_plain(
                 )
             }
         };
-        let (throughput, fate) = survive(throughput * weight, leaves, go_on, roulette, siblings);
+        let (throughput, fate) = survive(throughput, throughput * weight, leaves, go_on, roulette);
         (o, dir, throughput, pdf, fate)
     };
     match fate {

@@ -81,7 +81,7 @@ pub(super) fn cosine_direction(n: Vec3, u: [f32; 2]) -> (Vec3, bool) {
 }
 
 /// Throughput and density of the next direction `wi`, which is [`cosine_direction`] about the shading normal `n`, snapped; the weight of such a
-/// sample is the albedo. `go_on` in [0, 1) decides roulette, when `roulette` says that it takes place, with `siblings` times the throughput.
+/// sample is the albedo. `go_on` in [0, 1) decides roulette, when `roulette` says that it takes place.
 #[inline(always)]
 pub(super) fn onwards(
     throughput: Vec3,
@@ -92,11 +92,10 @@ pub(super) fn onwards(
     above: bool,
     go_on: f32,
     roulette: bool,
-    siblings: f32,
 ) -> (Vec3, f32, Fate) {
     let cos = wi.dot(n);
     let leaves = above & (cos > 0.0) & (wi.dot(normal) > 0.0);
-    let (throughput, fate) = survive(throughput * reflectance, leaves, go_on, roulette, siblings);
+    let (throughput, fate) = survive(throughput, throughput * reflectance, leaves, go_on, roulette);
     (throughput, cos * FRAC_1_PI, fate)
 }
 
@@ -110,26 +109,30 @@ pub(super) fn scattered_onwards(
     above: bool,
     go_on: f32,
     roulette: bool,
-    siblings: f32,
 ) -> (Vec3, f32, Fate) {
     // 0 / 0 of a direction that snapping took below the horizon is absorbed
-    let throughput = throughput * (scatter.value / scatter.pdf);
-    let (throughput, fate) = survive(throughput, above & (wi.dot(normal) > 0.0), go_on, roulette, siblings);
+    let after = throughput * (scatter.value / scatter.pdf);
+    let (throughput, fate) = survive(throughput, after, above & (wi.dot(normal) > 0.0), go_on, roulette);
     (throughput, scatter.pdf, fate)
 }
 
-/// What becomes of a path that `leaves` with a throughput, and its throughput then. Siblings are as likely to go on as an only child.
+/// What becomes of a path that `leaves` a vertex where its throughput went from `before` to `after`, and its throughput then.
+///
+/// It goes on with the probability that the vertex leaves it of its worth, so that its worth stays what the first vertices made it (absorption as in
+/// nature: Arvo and Kirk, "Particle Transport and Image Synthesis", SIGGRAPH 1990). By the throughput itself, as Mitsuba has it, a path that has met
+/// something dark first is ended at once, though its pixel needs it as much as a bright one does: relative error is what counts.
 #[inline(always)]
-pub(super) fn survive(throughput: Vec3, leaves: bool, go_on: f32, roulette: bool, siblings: f32) -> (Vec3, Fate) {
-    let largest = throughput.x.max(throughput.y).max(throughput.z);
-    let chance = if roulette { (largest * siblings).min(0.95) } else { 1.0 };
+pub(super) fn survive(before: Vec3, after: Vec3, leaves: bool, go_on: f32, roulette: bool) -> (Vec3, Fate) {
+    let largest = |v: Vec3| v.x.max(v.y).max(v.z);
+    let left = largest(after);
+    let chance = if roulette { (left / largest(before)).min(0.95) } else { 1.0 };
     // false for NaN
-    let fate = if !(leaves & (largest > 0.0)) {
+    let fate = if !(leaves & (left > 0.0)) {
         Fate::Absorbed
     } else if go_on >= chance {
         Fate::Roulette
     } else {
         Fate::On
     };
-    (throughput / chance, fate)
+    (after / chance, fate)
 }

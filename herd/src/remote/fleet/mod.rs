@@ -18,7 +18,7 @@ use tokio::sync::Notify;
 use super::deaths::{Held, MOST_KILLED, Verdict, keys};
 use super::message::{Answer, Beat, Done, Failure, Holds, Poll, Report, Stage, Work};
 use crate::driver::{Event, Executor, Finished, Launch};
-use crate::job::JobError;
+use crate::job::{JobError, PICTURE};
 use crate::report::Bytes;
 
 use state::{Doing, State, What, halved};
@@ -215,7 +215,8 @@ impl Fleet {
         if state.over {
             return Ok(Answer::Over);
         }
-        let unfit = !poll.aovs && state.stage.as_ref().is_some_and(|s| !s.frame.aovs.is_empty());
+        let can = |stage: &Stage| poll.picture == PICTURE && (poll.aovs || stage.frame.aovs.is_empty());
+        let unfit = !state.stage.as_ref().is_none_or(can);
         if unfit {
             state.set_unfit(poll.worker.number);
             return Ok(Answer::Wait);

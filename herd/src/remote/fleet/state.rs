@@ -257,8 +257,8 @@ impl State {
         let worker = self.workers[number as usize].as_mut();
         if worker.is_some_and(|w| !std::mem::replace(&mut w.unfit, true)) {
             tracing::warn!(
-                "worker {number} is of a version that knows no layers beside the picture, which the job asks for: it gets nothing to do until \
-                 its pod is made again of the current version"
+                "worker {number} is of a version that makes another picture of the scene, or knows no layers beside it, which the job asks for: it \
+                 gets nothing to do until its pod is made again of the current version"
             );
         }
     }

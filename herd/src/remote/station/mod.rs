@@ -21,7 +21,7 @@ use super::holdings::Holdings;
 use super::homes::Homes;
 use super::message::{Answer, Beat, Done, Failure, Holds, Poll, Reads, Report, Stage, Work, WorkerId};
 use super::traffic::Traffic;
-use crate::job::{JobError, JobSettings, NodeSpec, PreparedScene};
+use crate::job::{JobError, JobSettings, NodeSpec, PICTURE, PreparedScene};
 use crate::local::attempt::{FilmUse, Shared};
 use crate::local::nodes::Nodes;
 use crate::local::slots::StopFlag;
@@ -323,6 +323,7 @@ impl<'l> Station<'l> {
                 aovs: true,
                 builds: true,
                 previews: true,
+                picture: PICTURE,
                 holds: open.and_then(Opened::holds),
             };
             match self.link.poll(&poll) {

@@ -71,20 +71,21 @@ fn a_worker_that_knows_no_bands_is_given_none() {
     });
 }
 
-/// It would leave the layers out without a word: of a job that asks for some it gets nothing, of another one its share.
+/// It would leave the layers out without a word: of a job that asks for some it gets nothing, of another one its share. One that would make another
+/// picture gets nothing of any.
 #[test]
-fn a_worker_that_knows_no_layers_works_only_for_jobs_without() {
-    for layers in [true, false] {
+fn a_worker_that_knows_no_layers_or_makes_another_picture_gets_nothing_of_what_it_cannot_do() {
+    for (word, layers, fits) in [("aovs", true, false), ("aovs", false, true), ("picture", false, false)] {
         let mut spec = spec(Strategy::SchedulingGridOverlapReduced, 4, 2);
         spec.image.aovs = spec.image.aovs.filter(|_| layers);
         let (cluster, kept) = (Cluster { band: 1, ..Cluster::new(3) }, Arc::new(Kept::default()));
         let (fleet, depot) = (Fleet::new(3, "e"), cluster.depot(None));
         let wire = cluster.wire(&fleet);
         let works = Mutex::new(Vec::new());
-        // polls as a version without AOVs writes them, where the word is not known
+        // polls as a version writes them that does not know the word
         let old = Tap(cluster.wire(&fleet), |wire: &Wire, poll: &Poll| {
             let mut written = serde_json::to_value(poll).unwrap();
-            assert!(written.as_object_mut().unwrap().remove("aovs").is_some());
+            assert!(written.as_object_mut().unwrap().remove(word).is_some());
             let answer = wire.poll(&serde_json::from_value(written).unwrap())?;
             if let Answer::Work { work, .. } = &answer {
                 works.lock().unwrap().push((**work).clone());
@@ -106,15 +107,15 @@ fn a_worker_that_knows_no_layers_works_only_for_jobs_without() {
             }
             let keeper: Arc<dyn Keeper> = kept.clone();
             let result = run(&cluster.job(&spec, &depot, &fleet, "e"), &keeper, &Silent);
-            assert_eq!(fleet.unfit(), if layers { vec![0] } else { vec![] });
-            assert_eq!(fleet.is_up(0), !layers);
+            assert_eq!(fleet.unfit(), if fits { vec![] } else { vec![0] });
+            assert_eq!(fleet.is_up(0), fits);
             fleet.end();
             result.unwrap();
         });
-        assert!(cluster.picture(1) == expected(&spec), "layers: {layers}");
+        assert!(cluster.picture(1) == expected(&spec), "{word}, layers: {layers}");
         let works = works.lock().unwrap();
         // a scene is the same with and without
         let of_stage = works.iter().filter(|w| !matches!(w, super::super::Work::Prepare { .. })).count();
-        assert_eq!(of_stage == 0, layers, "{works:?}");
+        assert_eq!(of_stage > 0, fits, "{works:?}");
     }
 }

@@ -84,15 +84,14 @@ impl Block {
     /// What becomes of paths in their next directions.
     #[inline(always)]
     pub(super) fn lobes_onwards(&mut self, context: &Context) {
-        let siblings = context.frame.split as f32;
         if self.kinds.coat != [false; 2] {
             for i in 0..N {
                 self.leaving[i] = self.shading.get(i).dot(self.next_d.get(i));
             }
             self.leaving = self.shares_of_coats(context, &self.leaving);
         }
-        each!(self.coat: coats_onwards(siblings));
-        each!(self.metal: metals_onwards(siblings));
+        each!(self.coat: coats_onwards());
+        each!(self.metal: metals_onwards());
     }
 
     #[inline(always)]
@@ -136,18 +135,18 @@ impl Block {
     }
 
     #[inline(always)]
-    fn coats_onwards<const BECKMANN: bool>(&mut self, siblings: f32) {
+    fn coats_onwards<const BECKMANN: bool>(&mut self) {
         for i in 0..N {
             let scatter = self.coat_scatters::<BECKMANN>(i, self.next_d.get(i));
-            self.take_onwards(i, scatter, siblings, self.is_coat[i] & (self.is_beckmann[i] == BECKMANN));
+            self.take_onwards(i, scatter, self.is_coat[i] & (self.is_beckmann[i] == BECKMANN));
         }
     }
 
     #[inline(always)]
-    fn metals_onwards<const BECKMANN: bool>(&mut self, siblings: f32) {
+    fn metals_onwards<const BECKMANN: bool>(&mut self) {
         for i in 0..N {
             let scatter = self.metal_scatters::<BECKMANN>(i, self.next_d.get(i));
-            self.take_onwards(i, scatter, siblings, self.is_metal[i] & (self.is_beckmann[i] == BECKMANN));
+            self.take_onwards(i, scatter, self.is_metal[i] & (self.is_beckmann[i] == BECKMANN));
         }
     }
 
@@ -224,7 +223,7 @@ impl Block {
     }
 
     #[inline(always)]
-    fn take_onwards(&mut self, i: usize, scatter: Scatter, siblings: f32, yes: bool) {
+    fn take_onwards(&mut self, i: usize, scatter: Scatter, yes: bool) {
         let (throughput, pdf, fate) = scattered_onwards(
             self.throughput.get(i),
             scatter,
@@ -233,7 +232,6 @@ impl Block {
             self.above[i],
             self.go_on[i],
             self.roulette[i],
-            siblings,
         );
         self.next_throughput.set(i, select(yes, throughput, self.next_throughput.get(i)));
         self.next_pdf[i] = if yes { pdf } else { self.next_pdf[i] };

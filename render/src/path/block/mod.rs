@@ -459,7 +459,6 @@ impl Block {
 
     #[inline(always)]
     fn next_rays(&mut self, context: &Context) {
-        let siblings = context.frame.split as f32;
         for i in 0..N {
             let (d, above) = cosine_direction(self.shading.get(i), [self.direction[0][i], self.direction[1][i]]);
             self.next_d.set(i, d);
@@ -481,7 +480,6 @@ impl Block {
                 self.above[i],
                 self.go_on[i],
                 self.roulette[i],
-                siblings,
             );
             self.next_throughput.set(i, throughput);
             self.next_pdf[i] = pdf;
