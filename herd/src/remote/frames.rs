@@ -319,7 +319,8 @@ struct Resumed {
 /// not count: whoever wrote them did not move it.
 ///
 /// Where the pointer's record cannot be read, or what it stands on, the newest chain before it is followed: what came later is
-/// computed again.
+/// computed again. Where it is of another picture, which a version of other formulas began, the picture begins anew: films of the two are never
+/// added up.
 fn resume(nodes: &Nodes, image: &str, scope: &Scope, pointer: Option<(u64, String)>) -> Result<Vec<Resumed>, JobError> {
     let begin = || {
         let ledger = Ledger::new(image, scope.tiles);
@@ -327,7 +328,12 @@ fn resume(nodes: &Nodes, image: &str, scope: &Scope, pointer: Option<(u64, Strin
     };
     let Some((sequence, name)) = pointer else { return Ok(vec![begin()]) };
     let mut records = nodes.wait(journal::read(nodes.store().as_ref()))?;
-    records.retain(|n, r| r.sequence < sequence || *n == name);
+    if records.get(&name).is_some_and(|newest| newest.image != image) {
+        tracing::warn!("{name} was begun by a version that makes another picture of the scene: it is rendered anew");
+        return Ok(vec![begin()]);
+    }
+    // those of a picture that was begun before, too, stay until the job ends
+    records.retain(|n, r| r.image == image && (r.sequence < sequence || *n == name));
     let chain = journal::newest_of(image, records)?;
     let place = nodes.store().describe();
     let Some((tip, last)) = chain.records.last() else {

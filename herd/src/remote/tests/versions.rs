@@ -71,6 +71,32 @@ fn a_worker_that_knows_no_bands_is_given_none() {
     });
 }
 
+/// A version of other formulas began a picture, here one of another seed: it is another picture, and nothing of it comes into this one.
+#[test]
+fn a_picture_that_a_version_of_other_formulas_began_is_rendered_anew() {
+    let spec = spec(Strategy::SchedulingGridOverlapReduced, 4, 2);
+    let mut other = spec.clone();
+    other.sampling.seed = Some(spec.sampling.seed.unwrap_or(0) + 1);
+    let (cluster, kept) = (Cluster::new(3), Arc::new(Kept::default()));
+    begun(&cluster, &other, &kept, 4);
+    let before = kept.newest(0).unwrap();
+    // stopped before it has a record of its own, and after
+    begun(&cluster, &spec, &kept, 0);
+    let stopped = cluster.beside(
+        (&spec, &kept, "e3"),
+        |job| job,
+        |fleet, is_over| {
+            wait_for(|| {
+                kept.newest(0).unwrap() != before && kept.newest(0).unwrap().is_some_and(|p| p.0 >= 2) || is_over()
+            });
+            fleet.cancel("stopped by the test");
+        },
+    );
+    assert!(matches!(stopped, Err(JobError::Owned(_))), "{:?}", stopped.err());
+    cluster.render(&spec, &kept).unwrap();
+    assert!(cluster.picture(0) == expected(&spec));
+}
+
 /// It would leave the layers out without a word: of a job that asks for some it gets nothing, of another one its share. One that would make another
 /// picture gets nothing of any.
 #[test]
