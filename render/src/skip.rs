@@ -40,7 +40,7 @@ pub enum Skip {
     Sky,
     /// Siblings share the camera ray that each would have traced. Counted: rays not traced.
     Merged,
-    /// Paths worth little are ended by Russian roulette. Counted: paths.
+    /// Paths are ended by Russian roulette. Counted: paths.
     Roulette,
     /// AOVs that nobody asked for are not found. Counted: rays of batches that met something.
     Aovs,
