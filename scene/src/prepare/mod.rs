@@ -288,7 +288,8 @@ fn passes(
     Ok(Prepared { manifest, reference, reused: false, report }.into())
 }
 
-/// Reads the source: once if it is small or its bounds are known, else twice; the importer's own reading for bounds included.
+/// Reads the source: at most twice, the importer's own reading for bounds included. Once where nobody has to look for bounds (a volume), or where all records
+/// were kept when they were looked for.
 fn read(
     description: &Description,
     source: &dyn RecordSource,
