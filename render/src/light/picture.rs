@@ -4,7 +4,8 @@ use std::sync::Arc;
 
 use super::SkyMap;
 use super::map::{Place, Spot};
-use crate::math::UnitDir;
+use super::sun::Sun;
+use crate::math::{UnitDir, unit};
 use crate::real::{Vec3, f32};
 
 /// So many directions are worked at together: as many lines of memory as a processor fetches at a time, about.
@@ -64,6 +65,8 @@ pub(super) fn snapped(d: Vec3) -> Vec3 {
 #[derive(Clone, Debug)]
 pub(super) struct Directions {
     spots: [[f64; MANY]; 2],
+    is_sun: [bool; MANY],
+    of_sun: [[f32; MANY]; 2],
     directions: [[f32; MANY]; 3],
     patches: [[u32; MANY]; 2],
     within: [[f32; MANY]; 2],
@@ -71,12 +74,25 @@ pub(super) struct Directions {
 
 impl Directions {
     pub(super) fn new() -> Directions {
-        let (spots, directions) = ([[0.0; MANY]; 2], [[0.0; MANY]; 3]);
-        Directions { spots, directions, patches: [[0; MANY]; 2], within: [[0.0; MANY]; 2] }
+        Directions {
+            spots: [[0.0; MANY]; 2],
+            is_sun: [false; MANY],
+            of_sun: [[0.0; MANY]; 2],
+            directions: [[0.0; MANY]; 3],
+            patches: [[0; MANY]; 2],
+            within: [[0.0; MANY]; 2],
+        }
     }
 
     pub(super) fn set_spot(&mut self, i: usize, spot: Spot) {
         [self.spots[0][i], self.spots[1][i]] = [spot.x, spot.cos];
+    }
+
+    /// Whether a direction is one of the sun's, and its numbers.
+    #[inline(always)]
+    pub(super) fn set_sun(&mut self, i: usize, is_sun: bool, numbers: [u32; 2]) {
+        self.is_sun[i] = is_sun;
+        [self.of_sun[0][i], self.of_sun[1][i]] = [unit(numbers[0]), unit(numbers[1])];
     }
 
     pub(super) fn set(&mut self, i: usize, d: Vec3) {
@@ -93,12 +109,23 @@ impl Directions {
 
     /// Directions of the spots.
     #[inline(always)]
-    pub(super) fn turn(&mut self, picture: &Picture) {
+    pub(super) fn turn_spots(&mut self, picture: &Picture) {
         for i in 0..MANY {
             let d = picture.turned(Spot { x: self.spots[0][i], cos: self.spots[1][i] });
             self.directions[0][i] = d.x;
             self.directions[1][i] = d.y;
             self.directions[2][i] = d.z;
+        }
+    }
+
+    /// Directions of the sun, where they are its.
+    #[inline(always)]
+    pub(super) fn turn_to(&mut self, sun: &Sun) {
+        for i in 0..MANY {
+            let d = sun.sample([self.of_sun[0][i], self.of_sun[1][i]]);
+            self.directions[0][i] = if self.is_sun[i] { d.x } else { self.directions[0][i] };
+            self.directions[1][i] = if self.is_sun[i] { d.y } else { self.directions[1][i] };
+            self.directions[2][i] = if self.is_sun[i] { d.z } else { self.directions[2][i] };
         }
     }
 

@@ -9,7 +9,7 @@ use super::map::Place;
 use super::picture::{Directions, MANY, Picture, snapped};
 use super::sun::Sun;
 use super::{SkyMap, sphere, wide};
-use crate::math::luminance;
+use crate::math::{luminance, unit};
 use crate::real::{Vec3, f32};
 use crate::world::{Environment, World};
 
@@ -106,12 +106,12 @@ impl Sky {
     #[inline]
     pub(super) fn sample(&self, u: [u32; 2]) -> Option<(Vec3, Vec3, f32)> {
         if let (None, Dome::Constant(radiance)) = (&self.sun, &self.dome) {
-            let d = sphere::uniform(u.map(crate::math::unit));
+            let d = sphere::uniform(u.map(unit));
             return Some((d, *radiance, sphere::UNIFORM_PDF));
         }
-        let d = match self.choose(u) {
-            Part::Sun(d) => d,
-            Part::Dome(u) => self.dome.sample(u)?,
+        let d = match (self.choose(u), &self.sun) {
+            ((true, u), Some(sun)) => sun.sample(u.map(unit)),
+            ((_, u), _) => self.dome.sample(u)?,
         };
         let (radiance, pdf) = self.look_up(d);
         (pdf > 0.0).then_some((d, radiance, pdf))
@@ -123,28 +123,28 @@ impl Sky {
             numbers.iter().enumerate().for_each(|(i, u)| give(i, self.sample(*u)));
             return;
         };
-        let mut parts = [(Part::Sun(Vec3::ZERO), Default::default()); MANY];
         let mut many = Directions::new();
+        let (mut rests, mut cells) = ([[0; 2]; MANY], [Default::default(); MANY]);
         for (k, some) in numbers.chunks(MANY).enumerate() {
-            for (part, numbers) in parts.iter_mut().zip(some) {
-                let chosen = self.choose(*numbers);
-                *part = (chosen, if let Part::Dome(u) = chosen { picture.map.choose(u) } else { Default::default() });
+            // those of the dome in a list: no branch depends on a number
+            let (mut of_dome, mut count) = ([0; MANY], 0);
+            for (i, numbers) in some.iter().enumerate() {
+                let (is_sun, rest) = self.choose(*numbers);
+                rests[i] = rest;
+                many.set_sun(i, is_sun, rest);
+                of_dome[count & (MANY - 1)] = i;
+                count += usize::from(!is_sun);
             }
-            let parts = &parts[..some.len()];
-            for (i, (part, cell)) in parts.iter().enumerate() {
-                if let Part::Dome(u) = part {
-                    many.set_spot(i, picture.map.spot(cell, *u));
-                }
+            for &i in &of_dome[..count] {
+                cells[i] = picture.map.choose(rests[i]);
             }
-            wide::turn(&mut many, picture);
-            for (i, (part, _)) in parts.iter().enumerate() {
-                if let Part::Sun(d) = part {
-                    many.set(i, *d);
-                }
+            for &i in &of_dome[..count] {
+                many.set_spot(i, picture.map.spot(&cells[i], rests[i]));
             }
+            wide::turn(&mut many, self);
             wide::place(&mut many, picture);
-            (0..parts.len()).for_each(|i| picture.map.foresee(&many.place_of(i)));
-            for i in 0..parts.len() {
+            (0..some.len()).for_each(|i| picture.map.foresee(&many.place_of(i)));
+            for i in 0..some.len() {
                 let d = many.get(i);
                 let (radiance, pdf) = self.look_up_at(d, many.place_of(i));
                 give(k * MANY + i, (pdf > 0.0).then_some((d, radiance, pdf)));
@@ -152,29 +152,30 @@ impl Sky {
         }
     }
 
-    /// Whether numbers stand for the sun, and then for which direction.
-    #[inline]
-    fn choose(&self, u: [u32; 2]) -> Part {
-        let number = u64::from(u[0]);
-        match &self.sun {
-            // what is left of the number is as random
-            Some(sun) if number < self.sun_end => Part::Sun(sun.sample([((number << 32) / self.sun_end) as u32, u[1]])),
-            Some(_) => {
-                let rest = ((number - self.sun_end) << 32) / (WHOLE - self.sun_end);
-                Part::Dome([rest as u32, u[1]])
-            }
-            None => Part::Dome(u),
+    /// Whether numbers stand for the sun, and numbers for a direction of what they stand for: what is left of the first is as random.
+    #[inline(always)]
+    fn choose(&self, u: [u32; 2]) -> (bool, [u32; 2]) {
+        if self.sun_end == 0 {
+            return (false, u);
         }
+        let number = u64::from(u[0]);
+        let is_sun = number < self.sun_end;
+        let (start, count) = if is_sun { (0, self.sun_end) } else { (self.sun_end, WHOLE - self.sun_end) };
+        (is_sun, [(((number - start) << 32) / count) as u32, u[1]])
     }
 }
 
-/// What numbers stand for.
-#[derive(Clone, Copy, Debug)]
-enum Part {
-    /// A direction of the sun's.
-    Sun(Vec3),
-    /// Numbers for the dome.
-    Dome([u32; 2]),
+impl Directions {
+    /// Directions of the spots, and of the sun.
+    #[inline(always)]
+    pub(super) fn turn(&mut self, sky: &Sky) {
+        if let Dome::Map(picture) = &sky.dome {
+            self.turn_spots(picture);
+        }
+        if let Some(sun) = &sky.sun {
+            self.turn_to(sun);
+        }
+    }
 }
 
 impl Dome {
@@ -222,7 +223,7 @@ impl Dome {
     fn sample(&self, u: [u32; 2]) -> Option<Vec3> {
         match self {
             Dome::None => None,
-            Dome::Constant(_) => Some(snapped(sphere::uniform(u.map(crate::math::unit)))),
+            Dome::Constant(_) => Some(snapped(sphere::uniform(u.map(unit)))),
             Dome::Map(picture) => Some(picture.sample(u)),
         }
     }

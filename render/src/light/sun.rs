@@ -1,6 +1,6 @@
 //! A disk that shines evenly from infinitely far away.
 
-use crate::math::{Basis, UnitDir, luminance, sincos_turn, unit};
+use crate::math::{Basis, UnitDir, luminance, sincos_turn};
 use crate::real::consts::PI;
 use crate::real::{Vec3, f32};
 use crate::world;
@@ -47,12 +47,12 @@ impl Sun {
         (if self.up.dot(d) < 0.0 { Vec3::ZERO } else { self.radiance }, self.density)
     }
 
-    /// A direction as it travels: the snapped one of some at the edge lies outside.
-    #[inline]
-    pub(super) fn sample(&self, u: [u32; 2]) -> Vec3 {
-        let below = self.cap * unit(u[0]);
+    /// A direction by two numbers in [0, 1), as it travels: the snapped one of some at the edge lies outside.
+    #[inline(always)]
+    pub(super) fn sample(&self, u: [f32; 2]) -> Vec3 {
+        let below = self.cap * u[0];
         let sin = (below * (2.0 - below)).sqrt();
-        let (s, c) = sincos_turn(unit(u[1]));
+        let (s, c) = sincos_turn(u[1]);
         let d = self.basis.to_world(Vec3::new(sin * c, sin * s, 1.0 - below));
         Vec3::from(UnitDir::encode(d.to_array()).decode())
     }
@@ -90,7 +90,7 @@ mod tests {
             let mut counts = vec![0.0; rings * sectors];
             let mut outside = 0;
             for _ in 0..n {
-                let d = sun.sample([rng.u32(), rng.u32()]);
+                let d = sun.sample([rng.f32(), rng.f32()]);
                 let local = sun.basis.to_local(d).as_dvec3();
                 let below = 0.5 * (d - sun.basis.n).as_dvec3().length_squared() / f64::from(sun.cap);
                 let (radiance, pdf) = sun.look_up(d);
