@@ -8,7 +8,6 @@ use rayherd_render::bvh::Forest;
 use rayherd_render::memory::prefetch;
 use rayherd_render::path::{Surface, Surfaces};
 use rayherd_render::ray::{Hit, PrimId};
-use rayherd_render::world::Primitive;
 use rayherd_scene::grid::SplitSet;
 
 use crate::job::{JobError, PreparedScene};
@@ -192,11 +191,10 @@ impl ResidentSurfaces<'_> {
 }
 
 impl Surfaces for ResidentSurfaces<'_> {
-    #[inline]
+    #[inline(always)]
     fn surface(&self, _index: usize, hit: &Hit) -> Surface {
         let (attributes, local) = self.at(hit.prim);
         Surface {
-            shape: attributes.shape(local),
             geometry: self.resident.forest.primitive(hit),
             normals: attributes.normals(local),
             uv: attributes.block.uv(local),
@@ -207,14 +205,6 @@ impl Surfaces for ResidentSurfaces<'_> {
     fn shape(&self, _index: usize, hit: &Hit) -> u32 {
         let (attributes, local) = self.at(hit.prim);
         attributes.shape(local)
-    }
-    #[inline(always)]
-    fn flat_triangle(&self, _index: usize, hit: &Hit) -> Option<[[f32; 3]; 3]> {
-        let (attributes, local) = self.at(hit.prim);
-        match self.resident.forest.primitive(hit) {
-            Primitive::Triangle(vertices) if attributes.normals(local).is_none() => Some(vertices),
-            _ => None,
-        }
     }
     fn is_far(&self) -> bool {
         self.is_far

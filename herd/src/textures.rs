@@ -5,8 +5,10 @@
 
 use std::cell::{Ref, RefCell};
 use std::collections::{BTreeMap, BTreeSet};
-use std::sync::{Arc, Condvar, Mutex, PoisonError};
+use std::sync::{Condvar, Mutex, PoisonError};
 
+use bytes::{Bytes, BytesMut};
+use rayherd_render::memory::widen;
 use rayherd_render::texture::Textures;
 use rayherd_scene::objects::ObjectRef;
 
@@ -36,6 +38,11 @@ impl Tiles for StoredTiles<'_> {
     fn warm(&self, _: u32) {}
 }
 
+/// Bytes of all tiles.
+pub fn tile_bytes(scene: &PreparedScene) -> u64 {
+    scene.manifest.tiles.iter().map(|t| t.bytes).sum()
+}
+
 /// The object of a tile.
 pub fn tile_of(scene: &PreparedScene, number: u32) -> Result<&ObjectRef, JobError> {
     let missing = || JobError::Internal(format!("texture tile {number} was asked for"));
@@ -50,6 +57,8 @@ pub fn tile_holders(number: u32, nodes: u32, replicas: u32) -> Vec<u32> {
 /// A node's tiles.
 pub struct TileCache {
     budget: u64,
+    /// Bytes of all tiles: where these are within the budget, none is ever dropped.
+    all: u64,
     state: Mutex<State>,
     changed: Condvar,
 }
@@ -60,20 +69,25 @@ struct State {
     /// Tiles by when they were used last.
     by_use: BTreeMap<u64, u32>,
     loading: BTreeSet<u32>,
+    slab: BytesMut,
     clock: u64,
     bytes: u64,
     peak: u64,
 }
 
+/// Tiles that are never dropped lie one beside the other in pieces of so many bytes, in huge pages where there are any: look-ups that go
+/// from tile to tile need their pages at hand as well.
+const SLAB: usize = 16 << 20;
+
 struct Held {
-    tile: Arc<[u8]>,
+    tile: Bytes,
     used_at: u64,
 }
 
 impl TileCache {
-    /// A cache of so many bytes. One tile for each task is held even when that is more.
-    pub fn new(budget: u64) -> Self {
-        TileCache { budget, state: Mutex::default(), changed: Condvar::new() }
+    /// A cache of so many bytes, of tiles that have so many in `all`. One tile for each task is held even when that is more.
+    pub fn new(budget: u64, all: u64) -> Self {
+        TileCache { budget, all, state: Mutex::default(), changed: Condvar::new() }
     }
 
     /// The most bytes that it held at once.
@@ -86,6 +100,7 @@ impl TileCache {
         let mut state = self.lock();
         state.held.clear();
         state.by_use.clear();
+        state.slab = BytesMut::new();
         state.bytes = 0;
     }
 
@@ -98,7 +113,7 @@ impl TileCache {
     ///
     /// # Errors
     /// When it cannot be read.
-    pub fn get(&self, number: u32, from: &dyn Tiles) -> Result<Arc<[u8]>, JobError> {
+    pub fn get(&self, number: u32, from: &dyn Tiles) -> Result<Bytes, JobError> {
         let mut state = self.lock();
         loop {
             if let Some(tile) = state.touch(number) {
@@ -121,8 +136,11 @@ impl TileCache {
             }
         }
         let loading = Loading(self, number);
-        let tile: Arc<[u8]> = from.tile(number)?.into();
-        self.lock().insert(number, tile.clone(), self.budget);
+        let tile = from.tile(number)?;
+        let mut state = self.lock();
+        let tile = if self.all <= self.budget { state.lay(&tile, self.all) } else { Bytes::from(tile) };
+        state.insert(number, tile.clone(), self.budget);
+        drop(state);
         drop(loading);
         Ok(tile)
     }
@@ -130,7 +148,7 @@ impl TileCache {
 
 impl State {
     /// A tile that is held, now the last one used.
-    fn touch(&mut self, number: u32) -> Option<Arc<[u8]>> {
+    fn touch(&mut self, number: u32) -> Option<Bytes> {
         let held = self.held.get_mut(&number)?;
         self.clock += 1;
         self.by_use.remove(&held.used_at);
@@ -139,13 +157,23 @@ impl State {
         Some(held.tile.clone())
     }
 
-    fn insert(&mut self, number: u32, tile: Arc<[u8]>, budget: u64) {
+    /// A tile as part of the slab.
+    fn lay(&mut self, tile: &[u8], all: u64) -> Bytes {
+        if self.slab.capacity() < tile.len() {
+            self.slab = BytesMut::with_capacity(SLAB.min(all as usize).max(tile.len()));
+            widen(self.slab.spare_capacity_mut());
+        }
+        self.slab.extend_from_slice(tile);
+        self.slab.split().freeze()
+    }
+
+    fn insert(&mut self, number: u32, tile: Bytes, budget: u64) {
         let bytes = tile.len() as u64;
         // what a task has at hand is in memory whether it is held here or not
         let idle: Vec<(u64, u32)> = self
             .by_use
             .iter()
-            .filter(|(_, n)| self.held.get(n).is_some_and(|h| Arc::strong_count(&h.tile) == 1))
+            .filter(|(_, n)| self.held.get(n).is_some_and(|h| h.tile.is_unique()))
             .map(|(&at, &n)| (at, n))
             .take_while(|(_, n)| {
                 let over = self.bytes + bytes > budget;
@@ -168,7 +196,7 @@ impl State {
 }
 
 /// A tile and its number.
-type AtHand = (u32, Arc<[u8]>);
+type AtHand = (u32, Bytes);
 
 /// A task's textures: for one thread.
 pub struct TaskTextures<'a> {
@@ -264,7 +292,7 @@ mod tests {
 
     #[test]
     fn what_was_used_longest_ago_is_dropped() {
-        let cache = TileCache::new(300);
+        let cache = TileCache::new(300, 700);
         let from = Numbered::default();
         let get = |n: u32| cache.get(n, &from).unwrap()[0];
         for n in [1, 2, 3, 1, 4, 1, 3] {
@@ -289,11 +317,13 @@ mod tests {
 
     #[test]
     fn a_tile_is_read_once_for_all_who_ask() {
-        let cache = TileCache::new(1 << 20);
+        let cache = TileCache::new(1 << 20, 600);
         let from = Numbered::default();
         std::thread::scope(|scope| {
             for _ in 0..8 {
-                scope.spawn(|| (0..6).for_each(|n| assert_eq!(u32::from(cache.get(n, &from).unwrap()[0]), n)));
+                // as many as it holds: they lie in one piece
+                let get = |n: u32| cache.get(n, &from).unwrap();
+                scope.spawn(move || (0..6).for_each(|n| assert_eq!(get(n), [n as u8; 100].as_slice())));
             }
         });
         assert_eq!((from.read.load(Ordering::Relaxed), from.warm.load(Ordering::Relaxed)), (6, 42));

@@ -4,6 +4,8 @@
 //! (length u32, shape u32; neighbours differ), then 9 f32 of normals per primitive, then 6 f32 of texture coordinates per
 //! primitive, then 9 f32 of the attribute per primitive. A primitive without normals or attribute has nine zeros.
 
+use crate::memory::spacious;
+
 const MAGIC: &[u8; 4] = b"RHA1";
 const HEADER: usize = 16;
 
@@ -124,12 +126,13 @@ impl AttributeBlock {
         let uvs_end = normals_end + 24 * uvs;
         let threes = |at: usize| std::array::from_fn(|v| std::array::from_fn(|c| floats(at + 12 * v + 4 * c)));
         let twos = |at: usize| std::array::from_fn(|v| std::array::from_fn(|c| floats(at + 8 * v + 4 * c)));
-        Ok(AttributeBlock {
-            shapes,
-            normals: (runs_end..normals_end).step_by(36).map(threes).collect(),
-            uvs: (normals_end..uvs_end).step_by(24).map(twos).collect(),
-            attributes: (uvs_end..bytes.len()).step_by(36).map(threes).collect(),
-        })
+        // read here and there
+        let mut block =
+            AttributeBlock { shapes, normals: spacious(normals), uvs: spacious(uvs), attributes: spacious(attributes) };
+        block.normals.extend((runs_end..normals_end).step_by(36).map(threes));
+        block.uvs.extend((normals_end..uvs_end).step_by(24).map(twos));
+        block.attributes.extend((uvs_end..bytes.len()).step_by(36).map(threes));
+        Ok(block)
     }
 }
 

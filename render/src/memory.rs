@@ -19,24 +19,30 @@ pub fn prefetch<T>(place: &T) {
 pub(crate) const HUGE: usize = 2 << 20;
 /// From so many bytes on huge pages are asked for; they round up what is taken by less than a quarter.
 pub(crate) const HUGE_FROM: usize = 8 << 20;
+/// From so many bytes on [`widen`] asks for them: for the whole ones inside, which round up nothing.
+const WIDE_FROM: usize = 2 * HUGE;
 
 /// An empty vector with room for so many values, in huge pages if it is large and the system has them: for tables that are read here
 /// and there, where every read would look up its page too.
 pub(crate) fn spacious<T>(count: usize) -> Vec<T> {
     let mut values = Vec::with_capacity(count);
-    let room: &mut [std::mem::MaybeUninit<T>] = values.spare_capacity_mut();
+    widen(values.spare_capacity_mut());
+    values
+}
+
+/// Asks for huge pages for memory that nothing was written to, if it is large and the system has them.
+pub fn widen<T>(room: &mut [std::mem::MaybeUninit<T>]) {
     let bytes = size_of_val(room);
     #[cfg(target_os = "linux")]
-    if bytes >= HUGE_FROM {
+    if bytes >= WIDE_FROM {
         let start = room.as_mut_ptr().cast::<u8>();
         let skipped = start.align_offset(HUGE).min(bytes);
         let whole = (bytes - skipped) & !(HUGE - 1);
-        // SAFETY: the range lies in the vector's room; the advice changes none of its bytes, and a system that refuses it keeps small pages.
+        // SAFETY: the range lies in the room; the advice changes none of its bytes, and a system that refuses it keeps small pages.
         unsafe {
             libc::madvise(start.add(skipped).cast(), whole, libc::MADV_HUGEPAGE);
         }
     }
-    values
 }
 
 #[cfg(test)]

@@ -297,7 +297,10 @@ impl Scene {
 impl Surfaces for Scene {
     fn surface(&self, _: usize, _: &Hit) -> Surface {
         let uv = Some([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]);
-        Surface { shape: 0, geometry: Primitive::Triangle(TRIANGLE), normals: None, uv, attribute: None }
+        Surface { geometry: Primitive::Triangle(TRIANGLE), normals: None, uv, attribute: None }
+    }
+    fn shape(&self, _: usize, _: &Hit) -> u32 {
+        0
     }
     fn prim(&self, _: usize, _: &Hit) -> PrimId {
         0

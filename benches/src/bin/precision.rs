@@ -112,12 +112,15 @@ macro_rules! build {
                     let normals = block.normals.get(local).filter(|n| n.as_flattened().iter().any(|&x| x != 0.0));
                     let wide = |x: f32| <$real>::from(x);
                     Surface {
-                        shape: block.shapes[local],
                         geometry: self.forest.primitive(hit),
                         normals: normals.map(|n| n.map(|v| v.map(wide))),
                         uv: block.uvs.get(local).map(|t| t.map(|v| v.map(wide))),
                         attribute: block.attributes.get(local).map(|a| a.map(|v| v.map(wide))),
                     }
+                }
+                fn shape(&self, _: usize, hit: &Hit) -> u32 {
+                    let (block, local) = self.forest.slot(hit.prim);
+                    self.attributes[&block].shapes[local as usize]
                 }
                 fn prim(&self, _: usize, hit: &Hit) -> PrimId {
                     self.forest.prim_id(hit.prim)

@@ -43,6 +43,9 @@ impl Surfaces for NoSurfaces {
     fn surface(&self, _: usize, _: &Hit) -> Surface {
         unreachable!("a miss has no surface")
     }
+    fn shape(&self, _: usize, _: &Hit) -> u32 {
+        unreachable!("a miss has no shape")
+    }
     fn prim(&self, _: usize, _: &Hit) -> PrimId {
         unreachable!("a miss has no primitive")
     }

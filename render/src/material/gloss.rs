@@ -6,7 +6,7 @@ use super::plastic::Coated;
 use super::rough::Rough;
 use super::{Bsdf, Detail, Distribution, Material, Scatter, Slot, Transmittance, conductor, diffuse};
 use crate::real::{Vec3, f32};
-use crate::texture::{At, Texture, Textures};
+use crate::texture::{At, Spot, Texture, Textures};
 
 /// What a block needs of a material at a hit.
 #[derive(Clone, Copy, Debug)]
@@ -58,12 +58,10 @@ impl Material {
         is_known && self.detail.as_deref().is_none_or(is_paint)
     }
 
-    /// The model at a place as a block takes it; `None` where there is more to it.
-    pub(crate) fn look(&self, textures: &[Texture], tiles: &dyn Textures, at: At) -> Option<Look> {
-        if !self.has_look() {
-            return None;
-        }
-        let mut look = match &self.bsdf {
+    /// The model as a block takes it, textures aside; `None` where there is more to it.
+    #[inline(always)]
+    pub(crate) fn even_look(&self) -> Option<Look> {
+        Some(match &self.bsdf {
             Bsdf::Diffuse { reflectance } => Look::Diffuse(*reflectance),
             Bsdf::RoughPlastic { distribution, alpha, eta, diffuse, specular, nonlinear, coat } => Look::Coat(Coat {
                 distribution: *distribution,
@@ -78,9 +76,15 @@ impl Material {
                 Look::Metal(Metal { distribution: *distribution, alpha: *alpha, eta: *eta, k: *k, specular: *specular })
             }
             _ => return None,
-        };
+        })
+    }
+
+    /// The model at a place, of a material that [`Material::has_look`]. `first`: what the first of its textures reads there.
+    #[inline(always)]
+    pub(crate) fn look(&self, textures: &[Texture], tiles: &dyn Textures, at: At, first: &Spot) -> Option<Look> {
+        let mut look = self.even_look()?;
         let Some(detail) = &self.detail else { return Some(look) };
-        for &Textured { slot, texture, scale } in &detail.textured {
+        for (k, &Textured { slot, texture, scale }) in detail.textured.iter().enumerate() {
             let texture = &textures[texture as usize];
             match (slot, &mut look) {
                 (Slot::Diffuse, Look::Diffuse(color) | Look::Coat(Coat { diffuse: color, .. }))
@@ -88,7 +92,8 @@ impl Material {
                     Slot::Specular,
                     Look::Coat(Coat { specular: color, .. }) | Look::Metal(Metal { specular: color, .. }),
                 ) => {
-                    *color = scaled(texture.color(tiles, at), scale);
+                    let spot = if k == 0 { *first } else { texture.spot(at) };
+                    *color = scaled(texture.color_at(tiles, at, &spot), scale);
                 }
                 (Slot::Alpha, Look::Metal(metal)) => metal.alpha = share(texture.amount(tiles, at) * scale[0]),
                 // of no meaning for this model, as in `Material::at`

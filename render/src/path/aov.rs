@@ -56,8 +56,8 @@ fn first_hit<S: Surfaces>(
     mut take: impl FnMut(Aov, &[f32]),
 ) {
     let (world, frame, key) = (context.world, context.frame, ray.key);
-    let surface = surfaces.surface(index, hit);
-    let shape = &world.shapes[surface.shape as usize];
+    let (number, surface) = (surfaces.shape(index, hit), surfaces.surface(index, hit));
+    let shape = &world.shapes[number as usize];
     if shape.emission.is_some() && hidden(context, ray) {
         return;
     }
@@ -67,7 +67,7 @@ fn first_hit<S: Surfaces>(
         }
     };
     if key.sample == 0 {
-        add(Aov::ObjectId, &[(surface.shape + 1) as f32]);
+        add(Aov::ObjectId, &[(number + 1) as f32]);
         add(Aov::MaterialId, &[(shape.material + 1) as f32]);
     }
     // what was hidden may have been passed through on the way

@@ -285,7 +285,6 @@ mod tests {
             let p = [rng.vec3(1.0), rng.vec3(1.0), rng.vec3(1.0)];
             let uv = [0, 1, 2].map(|_| [rng.range(-1.0, 1.0), rng.range(-1.0, 1.0)]);
             let surface = Surface {
-                shape: 0,
                 geometry: Primitive::Triangle(p.map(|v| v.to_array())),
                 normals: None,
                 uv: Some(uv),
@@ -325,7 +324,7 @@ mod tests {
     fn a_normal_map_is_in_the_frame_of_u() {
         let vertices = [[0.0, 0.0, 0.0], [2.0, 0.0, 0.0], [0.0, 3.0, 0.0]];
         let uv = Some([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]);
-        let surface = Surface { shape: 0, geometry: Primitive::Triangle(vertices), normals: None, uv, attribute: None };
+        let surface = Surface { geometry: Primitive::Triangle(vertices), normals: None, uv, attribute: None };
         let d = Vec3::new(0.1, 0.2, -1.0).normalize();
         let mut at = Interaction::new(Vec3::Z, d, &hit(0.2, 0.3), &surface).unwrap();
         assert_eq!(at.place(&surface, &hit(0.2, 0.3)).uv, [0.2, 0.3]);
@@ -350,7 +349,6 @@ mod tests {
             let n = rng.direction();
             let (center, radius, flipped) = ([0.5, -1.0, 2.0], 0.7, k % 2 == 0);
             let surface = Surface {
-                shape: 0,
                 geometry: Primitive::Sphere { center, radius, flipped },
                 normals: None,
                 uv: None,

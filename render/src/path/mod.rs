@@ -112,8 +112,6 @@ pub struct Contribution {
 /// The primitive that was hit, with its attributes.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Surface {
-    /// Its shape.
-    pub shape: u32,
     /// Where it is.
     pub geometry: Primitive,
     /// Shading normals of a triangle's vertices; all zero for none.
@@ -126,20 +124,10 @@ pub struct Surface {
 
 /// Where hits get their surfaces from: the splits in memory.
 pub trait Surfaces {
-    /// The surface of the hit (never a miss) of ray `index` of the batch.
+    /// The shape of the hit (never a miss) of ray `index` of the batch.
+    fn shape(&self, index: usize, hit: &Hit) -> u32;
+    /// Its surface. To be inlined: callers use parts of it.
     fn surface(&self, index: usize, hit: &Hit) -> Surface;
-    /// Its shape's number: `surface().shape`.
-    fn shape(&self, index: usize, hit: &Hit) -> u32 {
-        self.surface(index, hit).shape
-    }
-    /// The vertices of a triangle without shading normals, `None` for everything else: what [`Surfaces::surface`] says, for callers that
-    /// need no more.
-    fn flat_triangle(&self, index: usize, hit: &Hit) -> Option<[[f32; 3]; 3]> {
-        match self.surface(index, hit) {
-            Surface { geometry: Primitive::Triangle(vertices), normals: None, .. } => Some(vertices),
-            _ => None,
-        }
-    }
     /// Whether surfaces lie in memory that is far: then [`Surfaces::foresee`] pays.
     fn is_far(&self) -> bool {
         false

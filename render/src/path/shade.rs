@@ -1,12 +1,12 @@
 //! Shading of a batch.
 
 #[cfg(not(feature = "double"))]
-use super::block::{Appearance, Block, Opaque};
+use super::block::Block;
 use super::interaction::{Interaction, triangle_place};
 use super::vertex::{Fate, cosine_direction, onwards, snap, survive, towards_light};
 use super::{Context, Contribution, Outcome, PathRay, ShadowRay, Surface, Surfaces, power_heuristic};
 use crate::light::Facing;
-use crate::material::{Blend, Bsdf, Look, Material, ReliefKind};
+use crate::material::{Blend, Bsdf, Material, ReliefKind};
 use crate::math::{UnitDir, unit};
 use crate::ray::{Hit, PathKey, Ray};
 use crate::real::{Vec3, f32};
@@ -63,14 +63,18 @@ pub fn shade_traced<S: Surfaces>(
             }
             continue;
         }
-        let Some(Leaving { material, children, throughput }) = arrive(context, surfaces, index, ray, hit, out) else {
+        let Some(Leaving { shape, material, children, throughput }) = arrive(context, surfaces, index, ray, hit, out)
+        else {
             continue;
         };
-        // where nothing is to be skipped by way of `scatter_plain`, which looks for detail
-        let opaque = if bares { opaque(context, surfaces, index, hit, traced.d, material) } else { None };
         for child in 0..children {
             let key = PathKey { branch: ray.key.branch + child as u16, ..ray.key };
-            if block.push(index as u32, key, throughput, opaque.as_ref()) {
+            block.push(index as u32, key, throughput);
+            // where nothing is to be skipped by way of `scatter_plain`, which looks for detail
+            if bares {
+                enter(context, surfaces, index, hit, traced.d, shape, material, &mut block);
+            }
+            if block.is_full() {
                 flush(context, surfaces, rays, hits, &mut block, out);
             }
         }
@@ -123,7 +127,8 @@ pub fn shade_plain<S: Surfaces>(context: &Context, surfaces: &S, rays: &[PathRay
         let Some(leaving) = arrive(context, surfaces, index, ray, hit, out) else { continue };
         for child in 0..leaving.children {
             let key = PathKey { branch: ray.key.branch + child as u16, ..ray.key };
-            scatter_plain(context, ray, key, leaving.throughput, hit, &surfaces.surface(index, hit), out);
+            let surface = surfaces.surface(index, hit);
+            scatter_plain(context, ray, key, leaving.throughput, hit, &surface, leaving.material, out);
         }
     }
 }
@@ -139,7 +144,9 @@ fn flush<S: Surfaces>(
 ) {
     block.flush(context, out, |index, key, throughput, out| {
         let (ray, hit) = (&rays[index], &hits[index]);
-        scatter_plain(context, ray, key, throughput, hit, &surfaces.surface(index, hit), out);
+        let (surface, world) = (surfaces.surface(index, hit), context.world);
+        let material = &world.materials[world.shapes[surfaces.shape(index, hit) as usize].material as usize];
+        scatter_plain(context, ray, key, throughput, hit, &surface, material, out);
     });
 }
 
@@ -167,6 +174,8 @@ fn emit(ray: &PathRay, radiance: Vec3, light_pdf: f32, out: &mut Outcome) {
 
 /// What leaves from a hit.
 struct Leaving<'a> {
+    /// Of this shape.
+    shape: u32,
     material: &'a Material,
     /// How many paths.
     children: u32,
@@ -175,51 +184,65 @@ struct Leaving<'a> {
 }
 
 #[cfg(not(feature = "double"))]
-/// A hit that a block takes.
+/// Gives the last vertex of a block its surface, if the block takes it: written where it is to stay, as copies of what was just written wait for it.
 #[inline(always)]
-fn opaque<S: Surfaces>(
+fn enter<S: Surfaces>(
     context: &Context,
     surfaces: &S,
     index: usize,
     hit: &Hit,
     d: [f32; 3],
+    shape: u32,
     material: &Material,
-) -> Option<Opaque> {
+    block: &mut Block,
+) {
     // most hits of most scenes
     if let (Bsdf::Diffuse { reflectance }, None) = (&material.bsdf, &material.detail)
-        && let Some(vertices) = surfaces.flat_triangle(index, hit)
+        && let Surface { geometry: Primitive::Triangle(vertices), normals: None, .. } = surfaces.surface(index, hit)
     {
-        let look = Appearance::Even(Look::Diffuse(*reflectance));
-        let (u, v, two_sided) = (hit.u, hit.v, material.two_sided);
-        return Some(Opaque { vertices, normals: None, u, v, d, look, two_sided, shape: 0 });
+        block.set_triangle(&vertices, hit, d, material.two_sided);
+        block.set_albedo(*reflectance);
+    } else if material.has_look() {
+        enter_with_look(context, surfaces, index, hit, d, shape, material, block);
     }
-    if material.has_look() { opaque_surface(context, surfaces, index, hit, d, material) } else { None }
 }
 
 #[cfg(not(feature = "double"))]
 /// The same of every look, with shading normals and textures.
 #[inline(never)]
-fn opaque_surface<S: Surfaces>(
+fn enter_with_look<S: Surfaces>(
     context: &Context,
     surfaces: &S,
     index: usize,
     hit: &Hit,
     d: [f32; 3],
+    shape: u32,
     material: &Material,
-) -> Option<Opaque> {
+    block: &mut Block,
+) {
     let surface = surfaces.surface(index, hit);
-    let Primitive::Triangle(vertices) = surface.geometry else { return None };
-    let textures = &context.world.textures;
-    let place = triangle_place(&surface, hit);
-    let look = match &material.detail {
+    let Primitive::Triangle(vertices) = &surface.geometry else { return };
+    match &material.detail {
         Some(detail) if !detail.textured.is_empty() => {
-            detail.textured.iter().for_each(|t| textures[t.texture as usize].foresee(context.textures, place));
-            Appearance::Painted(place)
+            let place = triangle_place(&surface, hit);
+            let mut first = None;
+            for textured in &detail.textured {
+                let texture = &context.world.textures[textured.texture as usize];
+                let spot = texture.spot(place);
+                texture.foresee(context.textures, &spot);
+                first.get_or_insert(spot);
+            }
+            block.set_place(shape, place, first.unwrap_or_default());
         }
-        _ => Appearance::Even(material.look(textures, context.textures, place)?),
-    };
-    let (normals, u, v, two_sided) = (surface.normals, hit.u, hit.v, material.two_sided);
-    Some(Opaque { vertices, normals, u, v, d, look, two_sided, shape: surface.shape })
+        _ => {
+            let Some(look) = material.even_look() else { return };
+            block.set_look(shape, &look);
+        }
+    }
+    block.set_triangle(vertices, hit, d, material.two_sided);
+    if let Some(normals) = &surface.normals {
+        block.set_normals(normals);
+    }
 }
 
 /// Emission, depth and splitting; `None` when the path ends here.
@@ -233,7 +256,8 @@ fn arrive<'a, S: Surfaces>(
     out: &mut Outcome,
 ) -> Option<Leaving<'a>> {
     let (frame, world) = (context.frame, context.world);
-    let shape = &world.shapes[surfaces.shape(index, hit) as usize];
+    let number = surfaces.shape(index, hit);
+    let (of_shape, shape) = (number, &world.shapes[number as usize]);
     if shape.emission.is_some() {
         if hidden(context, ray) {
             pass_through(surfaces, index, ray, hit, out);
@@ -256,13 +280,14 @@ fn arrive<'a, S: Surfaces>(
         // a mirror would send every sibling the same way
         if !material.is_mirror() {
             let share = throughput / frame.split as f32;
-            return Some(Leaving { material, children: if merged { frame.split } else { 1 }, throughput: share });
+            let children = if merged { frame.split } else { 1 };
+            return Some(Leaving { shape: of_shape, material, children, throughput: share });
         }
         if !is_first(context, ray) {
             return None;
         }
     }
-    Some(Leaving { material, children: 1, throughput })
+    Some(Leaving { shape: of_shape, material, children: 1, throughput })
 }
 
 /// Whether a ray is the camera's and must not see what emits light.
@@ -319,10 +344,10 @@ pub(super) fn scatter_plain(
     throughput: Vec3,
     hit: &Hit,
     surface: &Surface,
+    material: &Material,
     out: &mut Outcome,
 ) {
     let frame = context.frame;
-    let material = &context.world.materials[context.world.shapes[surface.shape as usize].material as usize];
     let d = Vec3::from(ray.dir.decode());
     let Some(mut at) = Interaction::new(Vec3::from(ray.o), d, hit, surface) else {
         out.counters.absorbed += 1;

@@ -29,6 +29,16 @@ pub enum Filter {
     Nearest,
 }
 
+/// Which texels a look-up reads, and how much of each.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub(crate) struct Spot {
+    /// Columns and rows of the nearest ones; both the same unless there is anything between texels.
+    x: [u32; 2],
+    y: [u32; 2],
+    /// Weights of the right and the lower ones.
+    within: [f32; 2],
+}
+
 /// An image: row 0 begins at v = 0.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Bitmap {
@@ -87,29 +97,48 @@ impl Bitmap {
     /// The colour at texture coordinates.
     #[inline]
     pub fn color(&self, tiles: &dyn Textures, uv: [f32; 2]) -> Vec3 {
+        self.color_at(tiles, &self.spot(uv))
+    }
+
+    /// What [`Bitmap::color`] reads.
+    #[inline(always)]
+    pub(super) fn spot(&self, uv: [f32; 2]) -> Spot {
         match self.filter {
             Filter::Nearest => {
                 let at = self.place(uv, 0.0);
-                let p = [self.wrapped(down(at[0]), 0), self.wrapped(down(at[1]), 1)];
-                let Some(texels) = tiles.tile(self.tile_at(p)) else { return Vec3::ZERO };
-                self.texel.read(self.channels, &texels, self.in_tile(p))
+                let [x, y] = [self.wrapped(down(at[0]), 0), self.wrapped(down(at[1]), 1)];
+                Spot { x: [x; 2], y: [y; 2], within: [0.0; 2] }
             }
             Filter::Bilinear => {
-                let ([v00, v10, v01, v11], [s, t]) = self.around(tiles, uv);
-                let v0 = v00 * (1.0 - s) + v10 * s;
-                let v1 = v01 * (1.0 - s) + v11 * s;
-                v0 * (1.0 - t) + v1 * t
+                let at = self.place(uv, 0.5);
+                // written out: `map` on arrays is a call
+                let corner = [down(at[0]), down(at[1])];
+                let within = [at[0] - corner[0] as f32, at[1] - corner[1] as f32];
+                Spot { x: self.pair(corner[0], 0), y: self.pair(corner[1], 1), within }
             }
         }
     }
 
-    /// Asks for the texels around a point; where they lie in several tiles, for those of the first.
-    pub(super) fn foresee(&self, tiles: &dyn Textures, uv: [f32; 2]) {
-        let at = self.place(uv, if self.filter == Filter::Nearest { 0.0 } else { 0.5 });
-        let [x, y] = [self.wrapped(down(at[0]), 0), self.wrapped(down(at[1]), 1)];
-        let Some(texels) = tiles.at_hand(self.tile_at([x, y])) else { return };
-        let n = self.in_tile([x, y]);
-        let row = self.tile_size([x / TILE, y / TILE])[0] as usize * self.texel_bytes();
+    /// The colour there.
+    #[inline]
+    pub(super) fn color_at(&self, tiles: &dyn Textures, spot: &Spot) -> Vec3 {
+        if self.filter == Filter::Nearest {
+            let Some(texels) = tiles.tile(self.tile_at([spot.x[0], spot.y[0]])) else { return Vec3::ZERO };
+            return self.texel.read(self.channels, &texels, self.in_tile([spot.x[0], spot.y[0]]));
+        }
+        let ([v00, v10, v01, v11], [s, t]) = (self.four(tiles, spot.x, spot.y), spot.within);
+        let v0 = v00 * (1.0 - s) + v10 * s;
+        let v1 = v01 * (1.0 - s) + v11 * s;
+        v0 * (1.0 - t) + v1 * t
+    }
+
+    /// Asks for the texels there; where they lie in several tiles, for those of the first.
+    #[inline]
+    pub(super) fn foresee(&self, tiles: &dyn Textures, spot: &Spot) {
+        let first = [spot.x[0], spot.y[0]];
+        let Some(texels) = tiles.at_hand(self.tile_at(first)) else { return };
+        let n = self.in_tile(first);
+        let row = self.tile_size([first[0] / TILE, first[1] / TILE])[0] as usize * self.texel_bytes();
         for at in [n, n + row] {
             if let Some(texel) = texels.get(at) {
                 prefetch(texel);
@@ -141,8 +170,8 @@ impl Bitmap {
         if self.filter == Filter::Nearest {
             return [0.0; 2];
         }
-        let (texels, [s, t]) = self.around(tiles, uv);
-        let [f00, f10, f01, f11] = texels.map(|c| self.amount(c));
+        let Spot { x, y, within: [s, t] } = self.spot(uv);
+        let [f00, f10, f01, f11] = self.four(tiles, x, y).map(|c| self.amount(c));
         let along = [(1.0 - t) * (f10 - f00) + t * (f11 - f01), (1.0 - s) * (f01 - f00) + s * (f11 - f10)];
         let [x, y] = [along[0] * self.size[0] as f32, along[1] * self.size[1] as f32];
         let m = &self.to_uv.0;
@@ -160,15 +189,17 @@ impl Bitmap {
         [along(0), along(1)]
     }
 
-    /// The four texels around a point, and the weights of the right and the lower ones.
+    /// The texels that stand for number `i` along an axis and the next.
     #[inline(always)]
-    fn around(&self, tiles: &dyn Textures, uv: [f32; 2]) -> ([Vec3; 4], [f32; 2]) {
-        let at = self.place(uv, 0.5);
-        // written out: `map` on arrays is a call
-        let corner = [down(at[0]), down(at[1])];
-        let x = [self.wrapped(corner[0], 0), self.wrapped(corner[0] + 1, 0)];
-        let y = [self.wrapped(corner[1], 1), self.wrapped(corner[1] + 1, 1)];
-        (self.four(tiles, x, y), [at[0] - corner[0] as f32, at[1] - corner[1] as f32])
+    fn pair(&self, i: i32, axis: usize) -> [u32; 2] {
+        let first = self.wrapped(i, axis);
+        let next = match self.wrap {
+            // a division less
+            Wrap::Repeat if first + 1 < self.size[axis] => first + 1,
+            Wrap::Repeat => 0,
+            _ => self.wrapped(i + 1, axis),
+        };
+        [first, next]
     }
 
     /// The texel that stands for number `i` along an axis.

@@ -16,6 +16,7 @@ use serde::{Deserialize, Serialize};
 use crate::math::luminance;
 use crate::real::{Vec3, f32};
 
+pub(crate) use bitmap::Spot;
 pub use bitmap::{Bitmap, Filter, Wrap};
 pub use checkerboard::Checkerboard;
 #[cfg(test)]
@@ -74,8 +75,23 @@ impl Texture {
     /// The colour at texture coordinates, linear Rec. 709; a grey image's value in all channels. 0 where a tile cannot be had.
     #[inline]
     pub fn color(&self, tiles: &dyn Textures, at: At) -> Vec3 {
+        self.color_at(tiles, at, &self.spot(at))
+    }
+
+    /// What a look-up reads.
+    #[inline]
+    pub(crate) fn spot(&self, at: At) -> Spot {
         match self {
-            Texture::Bitmap(bitmap) => bitmap.color(tiles, at.uv),
+            Texture::Bitmap(bitmap) => bitmap.spot(at.uv),
+            Texture::Checkerboard(_) | Texture::Attribute { .. } => Spot::default(),
+        }
+    }
+
+    /// [`Texture::color`] where it is known what it reads.
+    #[inline]
+    pub(crate) fn color_at(&self, tiles: &dyn Textures, at: At, spot: &Spot) -> Vec3 {
+        match self {
+            Texture::Bitmap(bitmap) => bitmap.color_at(tiles, spot),
             Texture::Checkerboard(checkerboard) => checkerboard.color(at.uv),
             Texture::Attribute { scale } => at.attribute * *scale,
         }
@@ -111,9 +127,9 @@ impl Texture {
 
     /// Asks for the texels of a look-up that will come.
     #[inline]
-    pub(crate) fn foresee(&self, tiles: &dyn Textures, at: At) {
+    pub(crate) fn foresee(&self, tiles: &dyn Textures, spot: &Spot) {
         if let Texture::Bitmap(bitmap) = self {
-            bitmap.foresee(tiles, at.uv);
+            bitmap.foresee(tiles, spot);
         }
     }
 

@@ -247,7 +247,10 @@ impl Surfaces for Seen<'_> {
     fn surface(&self, _index: usize, hit: &Hit) -> Surface {
         let (center, radius) = self.0.spheres[hit.prim as usize];
         let geometry = Primitive::Sphere { center, radius, flipped: false };
-        Surface { shape: hit.prim, geometry, normals: None, uv: None, attribute: None }
+        Surface { geometry, normals: None, uv: None, attribute: None }
+    }
+    fn shape(&self, _index: usize, hit: &Hit) -> u32 {
+        hit.prim
     }
     fn prim(&self, _: usize, hit: &Hit) -> PrimId {
         hit.prim.into()

@@ -22,7 +22,8 @@ macro_rules! each {
 
 impl Block {
     /// Notes the model of a vertex.
-    pub(super) fn set_look(&mut self, i: usize, look: &Look) {
+    #[inline(always)]
+    pub(super) fn look(&mut self, i: usize, look: &Look) {
         match look {
             Look::Diffuse(reflectance) => self.reflectance.set(i, (*reflectance).into()),
             Look::Coat(coat) => {

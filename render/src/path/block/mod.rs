@@ -15,10 +15,10 @@ use super::{Context, Outcome, PathRay, ShadowRay, wide};
 use crate::light::Choice;
 use crate::material::Look;
 use crate::math::{UnitDir, offset_origin, unit};
-use crate::ray::{PathKey, Ray};
+use crate::ray::{Hit, PathKey, Ray};
 use crate::sampler::{BSDF, LIGHT, LIGHT_CHOICE, LOBE, ROULETTE, Streams};
 use crate::skip::Skip;
-use crate::texture::At;
+use crate::texture::{At, Spot};
 
 /// Vertices of a block.
 pub(super) const N: usize = 32;
@@ -42,29 +42,6 @@ impl Lanes3 {
         self.0[1][i] = v.y;
         self.0[2][i] = v.z;
     }
-}
-
-/// A hit of a triangle that a block takes.
-#[derive(Clone, Copy, Debug)]
-pub(super) struct Opaque {
-    pub vertices: [[f32; 3]; 3],
-    pub normals: Option<[[f32; 3]; 3]>,
-    pub u: f32,
-    pub v: f32,
-    pub d: [f32; 3],
-    pub look: Appearance,
-    pub two_sided: bool,
-    /// Number of its shape, where the look is no even diffuse one.
-    pub shape: u32,
-}
-
-/// What a hit looks like.
-#[derive(Clone, Copy, Debug)]
-pub(super) enum Appearance {
-    /// The same everywhere.
-    Even(Look),
-    /// By textures at a place, whose texels were asked for: they are read when the block is full.
-    Painted(At),
 }
 
 /// What some vertex of a block has that not all have.
@@ -104,6 +81,7 @@ pub(super) struct Block {
     // of textures
     is_painted: [bool; N],
     at: [At; N],
+    spot: [Spot; N],
     // of lobes, where there are any
     is_coat: [bool; N],
     is_metal: [bool; N],
@@ -219,6 +197,7 @@ impl Default for Block {
             n2: Lanes3::ZERO,
             is_painted: [false; N],
             at: [At::uv([0.0; 2]); N],
+            spot: [Spot::default(); N],
             is_coat: [false; N],
             is_metal: [false; N],
             is_beckmann: [false; N],
@@ -277,46 +256,74 @@ impl Default for Block {
 }
 
 impl Block {
-    /// Adds a vertex of the ray at `index` of the batch, with a sibling's key and throughput, and its surface if a block takes it; true when the
-    /// block is full and must be flushed.
+    /// Adds a vertex of the ray at `index` of the batch, with a sibling's key and throughput. It passes through unless it is given a triangle.
     #[inline(always)]
-    pub(super) fn push(&mut self, index: u32, key: PathKey, throughput: Vec3, hit: Option<&Opaque>) -> bool {
-        // the mask changes nothing, and tells the compiler that there is a place
+    pub(super) fn push(&mut self, index: u32, key: PathKey, throughput: Vec3) {
         let i = self.len & (N - 1);
         self.index[i] = index;
         self.key[i] = key;
         self.throughput.set(i, throughput);
-        self.passes[i] = hit.is_none();
+        self.passes[i] = true;
         (self.is_smooth[i], self.is_painted[i]) = (false, false);
         (self.is_coat[i], self.is_metal[i]) = (false, false);
-        if let Some(hit) = hit {
-            self.p0.set(i, hit.vertices[0].into());
-            self.p1.set(i, hit.vertices[1].into());
-            self.p2.set(i, hit.vertices[2].into());
-            self.u[i] = hit.u;
-            self.v[i] = hit.v;
-            self.d.set(i, hit.d.into());
-            self.two_sided[i] = hit.two_sided;
-            match &hit.look {
-                Appearance::Even(Look::Diffuse(reflectance)) => self.reflectance.set(i, (*reflectance).into()),
-                Appearance::Even(look) => {
-                    self.shape[i] = hit.shape;
-                    self.set_look(i, look);
-                }
-                Appearance::Painted(at) => {
-                    (self.is_painted[i], self.kinds.painted) = (true, true);
-                    (self.shape[i], self.at[i]) = (hit.shape, *at);
-                }
-            }
-            if let Some([n0, n1, n2]) = hit.normals {
-                (self.is_smooth[i], self.kinds.smooth) = (true, true);
-                self.n0.set(i, n0.into());
-                self.n1.set(i, n1.into());
-                self.n2.set(i, n2.into());
-            }
-        }
         self.len += 1;
+    }
+
+    /// Whether it must be flushed before the next.
+    #[inline(always)]
+    pub(super) fn is_full(&self) -> bool {
         self.len == N
+    }
+
+    /// The last vertex. The mask changes nothing, and tells the compiler that there is a place.
+    #[inline(always)]
+    fn last(&self) -> usize {
+        self.len.wrapping_sub(1) & (N - 1)
+    }
+
+    /// The last vertex lies on a triangle, hit along `d`.
+    #[inline(always)]
+    pub(super) fn set_triangle(&mut self, vertices: &[[f32; 3]; 3], hit: &Hit, d: [f32; 3], two_sided: bool) {
+        let i = self.last();
+        self.passes[i] = false;
+        self.p0.set(i, vertices[0].into());
+        self.p1.set(i, vertices[1].into());
+        self.p2.set(i, vertices[2].into());
+        (self.u[i], self.v[i]) = (hit.u, hit.v);
+        self.d.set(i, d.into());
+        self.two_sided[i] = two_sided;
+    }
+
+    /// With shading normals.
+    #[inline(always)]
+    pub(super) fn set_normals(&mut self, [n0, n1, n2]: &[[f32; 3]; 3]) {
+        let i = self.last();
+        (self.is_smooth[i], self.kinds.smooth) = (true, true);
+        self.n0.set(i, Vec3::from(*n0));
+        self.n1.set(i, Vec3::from(*n1));
+        self.n2.set(i, Vec3::from(*n2));
+    }
+
+    /// It is diffuse, the same everywhere.
+    #[inline(always)]
+    pub(super) fn set_albedo(&mut self, albedo: [f32; 3]) {
+        self.reflectance.set(self.last(), albedo.into());
+    }
+
+    /// It looks the same everywhere on its shape.
+    #[inline(always)]
+    pub(super) fn set_look(&mut self, shape: u32, look: &Look) {
+        let i = self.last();
+        self.shape[i] = shape;
+        self.look(i, look);
+    }
+
+    /// It looks as textures say at a place, whose texels were asked for: they are read when the block is full. `first`: those of its first texture.
+    #[inline(always)]
+    pub(super) fn set_place(&mut self, shape: u32, at: At, first: Spot) {
+        let i = self.last();
+        (self.is_painted[i], self.kinds.painted) = (true, true);
+        (self.shape[i], self.at[i], self.spot[i]) = (shape, at, first);
     }
 
     /// Scatters all vertices and appends what comes of them to `out` in order; `plain` does those that pass through, by index, key and
@@ -353,8 +360,8 @@ impl Block {
         for i in 0..self.len {
             if self.is_painted[i] && !self.passes[i] {
                 let material = &world.materials[world.shapes[self.shape[i] as usize].material as usize];
-                match material.look(&world.textures, context.textures, self.at[i]) {
-                    Some(look) => self.set_look(i, &look),
+                match material.look(&world.textures, context.textures, self.at[i], &self.spot[i]) {
+                    Some(look) => self.look(i, &look),
                     None => self.passes[i] = true,
                 }
             }

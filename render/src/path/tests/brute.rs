@@ -140,9 +140,12 @@ impl Scene {
 
 impl Surfaces for Scene {
     fn surface(&self, _index: usize, hit: &Hit) -> Surface {
-        let (geometry, shape) = self.primitives[hit.prim as usize];
+        let (geometry, _) = self.primitives[hit.prim as usize];
         let (uv, attribute) = self.extras.get(&hit.prim).copied().unwrap_or_default();
-        Surface { shape, geometry, normals: self.normals[hit.prim as usize], uv, attribute }
+        Surface { geometry, normals: self.normals[hit.prim as usize], uv, attribute }
+    }
+    fn shape(&self, _index: usize, hit: &Hit) -> u32 {
+        self.primitives[hit.prim as usize].1
     }
     fn prim(&self, _index: usize, hit: &Hit) -> PrimId {
         hit.prim.into()
