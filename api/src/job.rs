@@ -246,7 +246,7 @@ pub struct ImageSpec {
 
 impl ImageSpec {
     /// Folders of a storage that are Rayherd's own.
-    pub const TAKEN: [&str; 4] = ["deleted", "jobs", "names", "objects"];
+    pub const TAKEN: [&str; 6] = ["deleted", "going", "jobs", "names", "objects", "uses"];
 
     /// The key of a picture of a cluster's job, from its path as `output` gives it.
     pub fn key(&self, namespace: &str, job: &str, path: &str) -> String {
@@ -332,12 +332,13 @@ pub struct WorkersSpec {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[schemars(range(min = 1, max = 4096))]
     pub max: Option<i32>,
-    /// Tasks at a time per node: one number for all nodes, or one for each. By default the threads of the machine.
+    /// Tasks at a time per node: one number for all nodes, or one for each. By default 1 on a cluster, and in a local run the threads of
+    /// the machine.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     #[schemars(inner(range(min = 1, max = 1024)))]
     pub slots: Vec<i32>,
     /// Scene data (geometry and attributes) that one node may hold in memory; rays and film come on top, bounded apart from it. By
-    /// default there is no limit.
+    /// default 1Gi on a cluster, and no limit in a local run.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub memory: Option<ByteSize>,
     /// Seconds for which a cluster keeps a finished job's workers, so that the same job with more samples goes on at once; 0 by default.

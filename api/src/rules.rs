@@ -83,8 +83,8 @@ pub const RULES: &[Rule] = &[
     ),
     (
         IMAGE,
-        "!has(self.prefix) || (self.prefix.split('/').all(p, p != '' && !p.startsWith('.')) && !(self.prefix.split('/')[0] in ['deleted', 'jobs', 'names', 'objects']))",
-        "spec.image.prefix is a relative path such as shots/room, and not in deleted, jobs, names or objects, which are Rayherd's own",
+        "!has(self.prefix) || (self.prefix.split('/').all(p, p != '' && !p.startsWith('.')) && !(self.prefix.split('/')[0] in ['deleted', 'going', 'jobs', 'names', 'objects', 'uses']))",
+        "spec.image.prefix is a relative path such as shots/room, and not in deleted, going, jobs, names, objects or uses, which are Rayherd's own",
     ),
     (IMAGE, same!("size"), "spec.image.size cannot be changed: make another job"),
     (IMAGE, same!("cameras"), "spec.image.cameras cannot be changed: make another job"),

@@ -206,7 +206,7 @@ fn every_rule_refuses_what_it_is_for_with_its_message_and_nothing_else() {
         (with("/image/prefix", json!("/shots")), "spec.image.prefix is a relative path"),
         (with("/image/prefix", json!("shots/")), "spec.image.prefix is a relative path"),
         (with("/image/prefix", json!("shots/../jobs")), "spec.image.prefix is a relative path"),
-        (with("/image/prefix", json!("jobs/u-1")), "not in deleted, jobs, names or objects"),
+        (with("/image/prefix", json!("jobs/u-1")), "not in deleted, going, jobs, names, objects or uses"),
         (with("/image/cameras/0/target", json!([0, 0, 5])), "a camera's target is its origin"),
         (with("/sampling/targetError", json!(0)), "spec.sampling.targetError is above 0"),
         (with("/sampling/timeLimit", json!(0)), "spec.sampling.timeLimit is above 0"),
