@@ -39,7 +39,7 @@ pub struct Metrics {
     asked: IntCounterVec,
     /// 1 for the operator that leads.
     pub leader: IntGauge,
-    /// How long steps take.
+    /// How long steps take, without what they wait for on purpose.
     pub reconcile_seconds: Histogram,
     of_jobs: OfJobs,
 }

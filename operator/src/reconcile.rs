@@ -165,19 +165,20 @@ pub fn failed(job: Arc<Seen>, error: &Error, context: Arc<Context>) -> Action {
 /// # Errors
 /// When the API server or the storage does not do what is asked; the step is tried again.
 pub async fn reconcile(job: Arc<Seen>, context: Arc<Context>) -> Result<Action, Error> {
-    let since = Instant::now();
+    let (since, mut waited) = (Instant::now(), Duration::ZERO);
     let result = match &job.0 {
-        Ok(job) => step(&Arc::new(job.clone()), &context).await,
+        Ok(job) => step(&Arc::new(job.clone()), &context, &mut waited).await,
         Err(invalid) => unreadable(invalid, &context).await,
     };
-    context.metrics.reconcile_seconds.observe(since.elapsed().as_secs_f64());
+    context.metrics.reconcile_seconds.observe(since.elapsed().saturating_sub(waited).as_secs_f64());
     if result.is_ok() {
         context.failures.succeeded(job.meta().uid.as_deref().unwrap_or_default());
     }
     result
 }
 
-async fn step(job: &Arc<RenderJobObject>, context: &Arc<Context>) -> Result<Action, Error> {
+/// `waited` is told how long it waited for what is no fault of the operator nor of the API server, so that nobody is alarmed by it.
+async fn step(job: &Arc<RenderJobObject>, context: &Arc<Context>, waited: &mut Duration) -> Result<Action, Error> {
     // somebody else's: nothing is made of it, and nothing said
     if job.spec.managed_by.as_deref().is_some_and(|m| m != MANAGED_BY) {
         return Ok(Action::await_change());
@@ -257,7 +258,7 @@ async fn step(job: &Arc<RenderJobObject>, context: &Arc<Context>) -> Result<Acti
     // asked before its end is told: one that comes in between is told next time
     let over = running.is_over();
     if !over {
-        keep_pods(job, context, &namespace, &uid, &running).await?;
+        keep_pods(job, context, (&namespace, &uid), &running, waited).await?;
     }
     tell(job, context, &jobs, status::running(job, &running, Timestamp::now())).await?;
     context.metrics.observe(&namespace, &job.name_any(), &running);
@@ -410,14 +411,16 @@ async fn depot(
 async fn keep_pods(
     job: &RenderJobObject,
     context: &Context,
-    namespace: &str,
-    uid: &str,
+    (namespace, uid): (&str, &str),
     running: &Running,
+    waited: &mut Duration,
 ) -> Result<(), Error> {
     let pods: Api<Pod> = Api::namespaced(context.client.clone(), namespace);
     let found = list_pods(&pods, uid).await?;
     if running.is_local() && job.spec.placement != Placement::None {
+        let from = Instant::now();
         sought(running).await;
+        *waited = from.elapsed();
     }
     let killed = newly_killed(&mut running.lock(), kills(&found));
     for kill in killed {
@@ -665,14 +668,15 @@ async fn tell(
 /// The job is being deleted: its thread ends, its objects go, the finalizer last.
 async fn delete(job: &RenderJobObject, context: &Context, jobs: &Api<Seen>, uid: &str) -> Result<Action, Error> {
     let finalizers = job.metadata.finalizers.clone().unwrap_or_default();
+    let namespace = job.namespace().unwrap_or_default();
     if !finalizers.iter().any(|f| f == FINALIZER) {
         context.jobs.remove(uid);
+        context.metrics.forget(&namespace, &job.name_any());
         return Ok(Action::await_change());
     }
     if !stop(context, uid, "the job is deleted") {
         return Ok(Action::requeue(SOON));
     }
-    let namespace = job.namespace().unwrap_or_default();
     // what a worker is about to write would stay for ever
     if !remove_pods(job, context, &namespace, uid).await? {
         return Ok(Action::requeue(SOON));

@@ -2,8 +2,10 @@
 
 use k8s_openapi::jiff::{SignedDuration, Timestamp};
 use kube::runtime::controller::Action;
+use rayherd_herd::store::{BlockStore, S3Store};
 use serde_json::{Value, json};
 
+use super::life::Bench;
 use super::*;
 
 #[tokio::test]
@@ -111,6 +113,50 @@ async fn a_deleted_job_goes_even_when_its_storage_went_first() {
     ];
     let (done, ..) = scenario(&deleted, steps).await;
     assert_eq!(done, Ok(Action::await_change()));
+}
+
+#[tokio::test]
+async fn what_a_deleted_job_wrote_goes_from_its_storage_but_its_pictures() {
+    const OTHERS: [&str; 3] = ["jobs/u-10/0/film/a", "objects/ab", "output/studio/box/box.exr"];
+    const ITS: [&str; 2] = ["jobs/u-1/0/film/a", "jobs/u-1/preview.png"];
+    let mut deleted = job();
+    deleted["metadata"]["deletionTimestamp"] = json!("2026-01-01T00:00:00Z");
+    deleted["metadata"]["finalizers"] = json!([FINALIZER]);
+    // with keys that the servers do not know nothing can be done there, ever: the job must not stay for that
+    for (key, left) in [("dGVzdC1rZXk=", OTHERS.to_vec()), ("b3RoZXI=", [&ITS[..], &OTHERS].concat())] {
+        let servers = [S3Server::start().await, S3Server::start().await];
+        for server in &servers {
+            ITS.iter().chain(&OTHERS).for_each(|key| server.put_raw(key, b"x"));
+        }
+        let mut found = begins_on(&servers, no_pods());
+        found[1].answer["data"]["AWS_ACCESS_KEY_ID"] = json!(key);
+        let mut steps = vec![step("GET", PODS, 200, no_pods())];
+        steps.extend(found.into_iter().take(2));
+        steps.push(step("PATCH", JOB, 200, deleted.clone()).with("/metadata/finalizers", json!([])));
+        let (done, ..) = scenario(&deleted, steps).await;
+        assert_eq!(done, Ok(Action::await_change()));
+        for server in &servers {
+            let listed = S3Store::new(server.settings("")).unwrap().list("").await.unwrap();
+            let mut keys: Vec<String> = listed.into_iter().map(|(key, _)| key).collect();
+            keys.sort();
+            let mut left = left.clone();
+            left.sort_unstable();
+            assert_eq!(keys, left);
+        }
+    }
+}
+
+#[tokio::test]
+async fn a_deleted_job_that_lost_its_finalizer_leaves_no_labels() {
+    let mut bench = Bench::begun(job()).await;
+    let labels = |bench: &Bench| bench.context.metrics.text().unwrap().matches("job=\"box\"").count();
+    assert!(labels(&bench) > 0);
+    bench.job["metadata"]["deletionTimestamp"] = json!("2026-01-01T00:00:00Z");
+    bench.job["metadata"]["finalizers"] = json!([]);
+    let running = bench.running();
+    assert_eq!(bench.step(vec![]).await.0, Ok(Action::await_change()));
+    assert_eq!(labels(&bench), 0);
+    running.fleet.cancel("the test is over");
 }
 
 #[tokio::test]

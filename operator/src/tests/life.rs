@@ -13,16 +13,16 @@ const REQUIRED: &str =
     "/spec/affinity/nodeAffinity/requiredDuringSchedulingIgnoredDuringExecution/nodeSelectorTerms/0/matchExpressions/0";
 
 /// An operator, the API server that it asks, and a job whose scene nobody has prepared yet.
-struct Bench {
-    context: Arc<Context>,
+pub struct Bench {
+    pub context: Arc<Context>,
     server: Server,
     stores: Vec<S3Server>,
-    job: Value,
+    pub job: Value,
 }
 
 impl Bench {
     /// A job that runs: its first worker's pod was made.
-    async fn begun(job: Value) -> Self {
+    pub async fn begun(job: Value) -> Self {
         let stores = vec![S3Server::start().await, S3Server::start().await];
         stores[0].put_raw("scenes/box/box.xml", b"<scene version='3.0.0'/>");
         let (context, server) = context();
@@ -34,7 +34,7 @@ impl Bench {
     }
 
     /// One step; the job has the status then that it was told.
-    async fn step(&mut self, steps: Vec<Step>) -> (Result<Action, String>, Vec<Value>) {
+    pub async fn step(&mut self, steps: Vec<Step>) -> (Result<Action, String>, Vec<Value>) {
         let seen: Seen = serde_json::from_value(self.job.clone()).unwrap();
         let reconciled = reconcile(Arc::new(seen), self.context.clone());
         let (done, said) = tokio::join!(reconciled, serve_on(&mut self.server, steps));
@@ -53,7 +53,7 @@ impl Bench {
         assert_ne!(done.unwrap(), Action::await_change());
     }
 
-    fn running(&self) -> Arc<Running> {
+    pub fn running(&self) -> Arc<Running> {
         self.context.jobs.get("u-1").expect("it runs")
     }
 
@@ -92,16 +92,16 @@ fn path(pod: &str) -> &'static str {
 }
 
 /// A pod is made.
-fn made(name: &str, uid: &str) -> Step {
+pub fn made(name: &str, uid: &str) -> Step {
     step("PATCH", path(name), 201, json!({"metadata": {"name": name, "uid": uid}})).with("/metadata/name", json!(name))
 }
 
-fn deleted(name: &str) -> Step {
+pub fn deleted(name: &str) -> Step {
     step("DELETE", path(name), 200, json!({"kind": "Pod", "apiVersion": "v1", "metadata": {}}))
 }
 
 /// A pod that runs, with these statuses of its containers.
-fn pod(number: u32, containers: Value) -> Value {
+pub fn pod(number: u32, containers: Value) -> Value {
     json!({
         "metadata": {"name": format!("box-w{number}"), "uid": format!("p-{number}"),
             "labels": {"rayherd.io/worker": number.to_string(), "rayherd.io/placed": "true"}},

@@ -21,6 +21,7 @@ mod jobs;
 mod ledger;
 mod life;
 mod pods;
+mod versions;
 
 /// One request that must come, and its answer.
 pub struct Step {

@@ -1,9 +1,10 @@
 //! The pods of a job that runs, made and made anew.
 
-use k8s_openapi::jiff::Timestamp;
+use k8s_openapi::jiff::{SignedDuration, Timestamp};
 use kube::runtime::controller::Action;
 use serde_json::{Value, json};
 
+use super::life::{Bench, made};
 use super::*;
 
 #[tokio::test]
@@ -48,6 +49,31 @@ async fn the_first_worker_comes_up_beside_the_source() {
     assert_eq!(terms.len(), 1, "{terms:?}");
     assert_eq!(terms[0].pointer("/preference/matchExpressions/0/values"), Some(&json!(["node2"])));
     context.jobs.get("u-1").expect("it runs").fleet.cancel("the test is over");
+}
+
+#[tokio::test]
+async fn waiting_for_where_the_scene_lies_is_no_latency_of_the_operator() {
+    const SOUGHT_FOR: Duration = Duration::from_secs(1);
+    let mut bench = Bench::begun(job()).await;
+    let running = bench.running();
+    {
+        let mut state = running.lock();
+        // as if it began in an hour: it waits until somebody says where
+        (state.started, state.source) = (Some(Timestamp::now() + SignedDuration::from_hours(1)), None);
+    }
+    let seconds = bench.context.metrics.reconcile_seconds.clone();
+    let (count, sum) = (seconds.get_sample_count(), seconds.get_sample_sum());
+    let found = async {
+        tokio::time::sleep(SOUGHT_FOR).await;
+        assert_eq!(seconds.get_sample_count(), count, "it does not wait");
+        running.lock().source = Some(Default::default());
+    };
+    let steps = vec![step("GET", PODS, 200, no_pods()), made("box-w0", "p-9")];
+    let ((done, _), ()) = tokio::join!(bench.step(steps), found);
+    assert_ne!(done.unwrap(), Action::await_change());
+    assert_eq!(seconds.get_sample_count(), count + 1);
+    // what it did beside waiting is two requests to a server in the same process
+    assert!(seconds.get_sample_sum() - sum < SOUGHT_FOR.as_secs_f64());
 }
 
 #[tokio::test]
