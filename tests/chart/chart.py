@@ -134,6 +134,16 @@ def defaults(r, _):
     for name in ("rayherd-operator", "rayherd-metrics"):
         for p in r.one("Service", name)["spec"]["ports"]:
             assert p["port"] == ports[p["targetPort"]], name
+    # people: who views may not change, who edits may do what a job's owner does and nothing to its status, which is the operator's
+    aggregate = "rbac.authorization.k8s.io/aggregate-to-"
+    people = {
+        "viewer": ({"renderjobs", "renderjobs/status"}, {"get", "list", "watch"}, {"view"}),
+        "editor": ({"renderjobs"}, {"create", "update", "patch", "delete", "deletecollection"}, {"edit", "admin"}),
+    }
+    for name, (resources, verbs, roles) in people.items():
+        role = r.one("ClusterRole", f"rayherd-{name}")
+        assert grants(role) == {("rayherd.io", resource): verbs for resource in resources}, role
+        assert role["metadata"]["labels"] == {f"{aggregate}{to}": "true" for to in roles}, role
     # helm test's pod can do what it does
     assert grants(r.one("Role", "rayherd-trial"))[("rayherd.io", "renderjobs")] >= {"create", "patch", "get", "delete"}
     r.one("Role", "rayherd-trial-servers", STORE)
