@@ -27,6 +27,8 @@ QUIET = 0.1
 # pixels of 65,536 that are left out of the error of each picture, the worst of it. One pixel of veach-mis shows a two-thousandth part of its smallest light: a render of
 # 16 samples hits it once in 120 times and is then wrong by a relMSE of 0.24, by whatever renderer, which would decide the mean of any number of repeats
 WORST = {"veach-mis": 16}
+# from which ray on Mitsuba's roulette ends paths where its 5 is not its best: error times CPU of 2, 3, 4, 5 and 8 was tried on each room (docs/benchmarks/tried.md)
+RR_DEPTH = {"living-room": 2}
 # sets of repeats from which an interval is made
 DRAWS = 1000
 SCENES = ["cornell", "gyroid", "staircase", "living-room", "veach-mis", "classroom", *scenes.MANY_LIGHTS, "ajar-door"]
@@ -35,14 +37,16 @@ OWN_REFERENCE = {*scenes.MANY_LIGHTS, "ajar-door"}
 
 MITSUBA = """
 import resource, sys, numpy as np, mitsuba as mi
-variant, xml, spp, seed, out = sys.argv[1], sys.argv[2], int(sys.argv[3]), int(sys.argv[4]), sys.argv[5]
+variant, xml, spp, seed, out, depths = sys.argv[1], sys.argv[2], int(sys.argv[3]), int(sys.argv[4]), sys.argv[5], sys.argv[6]
 mi.set_variant(variant)
 def cpu():
     used = resource.getrusage(resource.RUSAGE_SELF)
     return used.ru_utime + used.ru_stime
-scene = mi.load_file(xml, **dict(kv.split('=') for kv in sys.argv[6:]))
+scene = mi.load_file(xml, **dict(kv.split('=') for kv in sys.argv[7:]))
+max_depth, rr_depth = map(int, depths.split(','))
+integrator = mi.load_dict({'type': 'path', 'max_depth': max_depth, 'rr_depth': rr_depth}) if rr_depth else None
 start = cpu()
-image = np.array(mi.render(scene, spp=spp, seed=seed), dtype=np.float32)[:, :, :3]
+image = np.array(mi.render(scene, integrator=integrator, spp=spp, seed=seed), dtype=np.float32)[:, :, :3]
 print(cpu() - start)
 np.save(out, image)
 """
@@ -52,7 +56,7 @@ class Renderer:
     def __init__(self, name: str, variant: str | None):
         self.name, self.variant = name, variant
 
-    def render(self, a, xml: Path, spp: int, seed: int) -> dict:
+    def render(self, a, name: str, xml: Path, spp: int, seed: int) -> dict:
         """CPU, wall and CPU without start and loading, and the image."""
         out, report = a.work / f"bench-{self.name}.npy", a.work / "bench.json"
         if self.variant is None:
@@ -61,7 +65,8 @@ class Renderer:
                        "--max-depth", str(a.max_depth), "-o", str(exr), "--report", str(report)]
         else:
             values = scenes.parameters(xml, SIZE, a.max_depth)
-            command = [sys.executable, "-c", MITSUBA, self.variant, str(scenes.read_by_mitsuba(xml)), str(spp), str(seed), str(out)]
+            command = [sys.executable, "-c", MITSUBA, self.variant, str(scenes.read_by_mitsuba(xml)), str(spp), str(seed), str(out),
+                       f"{a.max_depth},{RR_DEPTH.get(name, 0)}"]
             command += [f"{k}={v}" for k, v in values.items()]
         cpu, wall, text = run(command)
         if self.variant is None:
@@ -92,7 +97,7 @@ def reference(a, name: str, xml: Path, target: float) -> dict:
             return r
     renderer, sums, counts, spp = RENDERERS[0 if name in OWN_REFERENCE else 1], [0.0, 0.0], [0, 0], 1024
     for i in range(64):
-        sums[i % 2] = sums[i % 2] + renderer.render(a, xml, spp, 100_000 + i)["image"]
+        sums[i % 2] = sums[i % 2] + renderer.render(a, name, xml, spp, 100_000 + i)["image"]
         counts[i % 2] += 1
         if i % 2:
             halves = [s / n for s, n in zip(sums, counts)]
@@ -237,11 +242,11 @@ def main() -> None:
         target = TARGETS.get(name, TARGET)
         ref = reference(a, name, xml, target)
         for r in renderers:
-            r.render(a, xml, 1, 0)  # fills kernel and page caches
+            r.render(a, name, xml, 1, 0)  # fills kernel and page caches
         for repeat in range(a.repeats):
             for spp in a.spp:
                 for r in renderers:
-                    got = r.render(a, xml, spp, 12_345 + 7919 * repeat + spp)
+                    got = r.render(a, name, xml, spp, 12_345 + 7919 * repeat + spp)
                     row = {"scene": name, "renderer": r.name, "spp": spp, "repeat": repeat, "cpu_s": round(got["cpu"], 3), "wall_s": round(got["wall"], 3),
                            "render_cpu_s": round(got["render"], 3), "rel_mse": error(ref, got["image"], WORST.get(name, 0)), "mean": float(got["image"].mean())}
                     rows.append(row)
