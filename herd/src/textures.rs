@@ -38,8 +38,8 @@ impl Tiles for StoredTiles<'_> {
     fn warm(&self, _: u32) {}
 }
 
-/// Bytes of all tiles.
-pub fn tile_bytes(scene: &PreparedScene) -> u64 {
+/// Bytes of all tiles as a node holds them: equal ones each.
+pub fn all_tile_bytes(scene: &PreparedScene) -> u64 {
     scene.manifest.tiles.iter().map(|t| t.bytes).sum()
 }
 
@@ -76,7 +76,7 @@ struct State {
 }
 
 /// Tiles that are never dropped lie one beside the other in pieces of so many bytes, in huge pages where there are any: look-ups that go
-/// from tile to tile need their pages at hand as well.
+/// from tile to tile need their pages at hand as well. Eight of these: what a piece has beside its whole ones is little of it.
 const SLAB: usize = 16 << 20;
 
 struct Held {
@@ -138,7 +138,8 @@ impl TileCache {
         let loading = Loading(self, number);
         let tile = from.tile(number)?;
         let mut state = self.lock();
-        let tile = if self.all <= self.budget { state.lay(&tile, self.all) } else { Bytes::from(tile) };
+        let tile =
+            if self.all <= self.budget { state.lay(&tile, SLAB.min(self.all as usize)) } else { Bytes::from(tile) };
         state.insert(number, tile.clone(), self.budget);
         drop(state);
         drop(loading);
@@ -157,10 +158,10 @@ impl State {
         Some(held.tile.clone())
     }
 
-    /// A tile as part of the slab.
-    fn lay(&mut self, tile: &[u8], all: u64) -> Bytes {
+    /// A tile as part of a piece of memory of so many bytes, or of its own size if that is more; where the last piece has no room, of another.
+    fn lay(&mut self, tile: &[u8], piece: usize) -> Bytes {
         if self.slab.capacity() < tile.len() {
-            self.slab = BytesMut::with_capacity(SLAB.min(all as usize).max(tile.len()));
+            self.slab = BytesMut::with_capacity(piece.max(tile.len()));
             widen(self.slab.spare_capacity_mut());
         }
         self.slab.extend_from_slice(tile);
@@ -170,9 +171,8 @@ impl State {
     fn insert(&mut self, number: u32, tile: Bytes, budget: u64) {
         let bytes = tile.len() as u64;
         // what a task has at hand is in memory whether it is held here or not
-        let idle: Vec<(u64, u32)> = self
-            .by_use
-            .iter()
+        let by_use = self.by_use.iter().take(if self.bytes + bytes > budget { usize::MAX } else { 0 });
+        let idle: Vec<(u64, u32)> = by_use
             .filter(|(_, n)| self.held.get(n).is_some_and(|h| h.tile.is_unique()))
             .map(|(&at, &n)| (at, n))
             .take_while(|(_, n)| {
@@ -313,6 +313,26 @@ mod tests {
         assert!(cache.lock().bytes <= 300);
         cache.clear();
         assert_eq!(cache.lock().bytes, 0);
+    }
+
+    #[test]
+    fn tiles_that_stay_lie_together() {
+        let mut state = State::default();
+        let laid: Vec<(u8, Bytes)> = [100, 100, 57, 300, 1, 255, 256, 0]
+            .iter()
+            .zip(1..)
+            .map(|(&n, k)| (k, state.lay(&vec![k; n], 256)))
+            .collect();
+        for (k, tile) in &laid {
+            assert!(tile.iter().all(|b| b == k));
+        }
+        // 57 did not go beside the first two, and 300 is a piece of its own
+        let at = |k: usize| laid[k].1.as_ptr();
+        assert!(at(1) == at(0).wrapping_add(100) && at(2) != at(1).wrapping_add(100));
+        // what is in somebody's hands stays when the cache is cleared
+        state.slab = BytesMut::new();
+        assert_eq!(laid[3].1, [4; 300].as_slice());
+        assert_eq!(state.lay(&[9; 8], 256), [9; 8].as_slice());
     }
 
     #[test]

@@ -107,7 +107,10 @@ impl Metrics {
             Ok(counter)
         };
         let buckets = vec![0.001, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0, 3.0];
-        let options = HistogramOpts::new("rayherd_reconcile_duration_seconds", "duration of a reconcile step");
+        let options = HistogramOpts::new(
+            "rayherd_reconcile_duration_seconds",
+            "duration of a reconcile step, without what it waits for on purpose",
+        );
         let reconcile_seconds = Histogram::with_opts(options.buckets(buckets))?;
         registry.register(Box::new(reconcile_seconds.clone()))?;
         let name = "rayherd_worker_requests_refused_total";

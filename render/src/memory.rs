@@ -17,9 +17,9 @@ pub fn prefetch<T>(place: &T) {
 
 /// Size of a huge page on x86-64 and, most often, on aarch64.
 pub(crate) const HUGE: usize = 2 << 20;
-/// From so many bytes on huge pages are asked for; they round up what is taken by less than a quarter.
+/// From so many bytes on an arena asks for huge pages; they round up what it takes by less than a quarter.
 pub(crate) const HUGE_FROM: usize = 8 << 20;
-/// From so many bytes on [`widen`] asks for them: for the whole ones inside, which round up nothing.
+/// From so many bytes on [`widen`] asks for them, for the whole ones inside: one at least, wherever the memory begins.
 const WIDE_FROM: usize = 2 * HUGE;
 
 /// An empty vector with room for so many values, in huge pages if it is large and the system has them: for tables that are read here
@@ -30,7 +30,7 @@ pub(crate) fn spacious<T>(count: usize) -> Vec<T> {
     values
 }
 
-/// Asks for huge pages for memory that nothing was written to, if it is large and the system has them.
+/// Asks for huge pages for memory that nothing was written to, if it is large and the system has them. A hint: what was written before keeps its pages.
 pub fn widen<T>(room: &mut [std::mem::MaybeUninit<T>]) {
     let bytes = size_of_val(room);
     #[cfg(target_os = "linux")]

@@ -7,7 +7,7 @@ use clap::Args;
 use rayherd_api::{RenderJob, RenderJobSpec};
 use rayherd_herd::job::{JobError, PreparedScene};
 use rayherd_herd::resident::Resident;
-use rayherd_herd::textures::{DEFAULT_BUDGET, StoredTiles, TaskTextures, TileCache, tile_bytes};
+use rayherd_herd::textures::{DEFAULT_BUDGET, StoredTiles, TaskTextures, TileCache, all_tile_bytes};
 use rayherd_render::bvh::{Kernel, Tracer};
 use rayherd_render::film::FilmPart;
 use rayherd_render::path::{Outcome, PathRay, ShadowRay, Surfaces, camera_ray, shade};
@@ -75,7 +75,7 @@ pub fn run(arguments: &Arguments) -> anyhow::Result<ExitCode> {
         film: FilmPart::new(frame.size),
         text: format!("pixel {x},{y} sample {} of {}, seed {}\n", arguments.sample, arguments.scene, frame.seed),
     };
-    let (cache, tiles) = (TileCache::new(DEFAULT_BUDGET, tile_bytes(&scene)), StoredTiles(&scene));
+    let (cache, tiles) = (TileCache::new(DEFAULT_BUDGET, all_tile_bytes(&scene)), StoredTiles(&scene));
     let textures = TaskTextures::new(&scene, &cache, &tiles, 1);
     let context = scene.context(&frame).with(&textures);
     let mut out = Outcome::default();

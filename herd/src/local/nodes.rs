@@ -17,7 +17,7 @@ use crate::plan::place;
 use crate::report::{Bytes, Kind, NodeReport, Op, Place, Stage};
 use crate::resident::{Blocks, Memory};
 use crate::store::{BlockStore, StoreError, kind_of_key};
-use crate::textures::{TileCache, Tiles, tile_bytes, tile_holders, tile_of};
+use crate::textures::{TileCache, Tiles, all_tile_bytes, tile_holders, tile_of};
 use crate::wire::WireError;
 
 /// Nodes that get a copy of each split: a function of the scene and their number, so that all who ask agree.
@@ -127,7 +127,11 @@ impl<'a> Nodes<'a> {
             runtime,
             replicas,
             memories: settings.nodes.iter().map(|_| Memory::new(memory)).collect(),
-            tiles: settings.nodes.iter().map(|_| TileCache::new(settings.texture_memory, tile_bytes(scene))).collect(),
+            tiles: settings
+                .nodes
+                .iter()
+                .map(|_| TileCache::new(settings.texture_memory, all_tile_bytes(scene)))
+                .collect(),
             holders: RwLock::new(holders),
             counts: Mutex::new(Counts { nodes, ..Counts::default() }),
             read: None,

@@ -69,11 +69,13 @@ async fn waiting_for_where_the_scene_lies_is_no_latency_of_the_operator() {
         running.lock().source = Some(Default::default());
     };
     let steps = vec![step("GET", PODS, 200, no_pods()), made("box-w0", "p-9")];
+    let began = std::time::Instant::now();
     let ((done, _), ()) = tokio::join!(bench.step(steps), found);
+    let took = began.elapsed();
     assert_ne!(done.unwrap(), Action::await_change());
     assert_eq!(seconds.get_sample_count(), count + 1);
-    // what it did beside waiting is two requests to a server in the same process
-    assert!(seconds.get_sample_sum() - sum < SOUGHT_FOR.as_secs_f64());
+    // however slow the machine: what was waited for, all of that time but for the requests before it, is not in it
+    assert!(seconds.get_sample_sum() - sum <= (took - SOUGHT_FOR / 2).as_secs_f64());
 }
 
 #[tokio::test]

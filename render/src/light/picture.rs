@@ -10,6 +10,8 @@ use crate::real::{Vec3, f32};
 
 /// So many directions are worked at together: as many lines of memory as a processor fetches at a time, about.
 pub(super) const MANY: usize = 32;
+// places in lists are cut to it by a mask
+const _: () = assert!(MANY.is_power_of_two());
 
 /// A picture, turned.
 #[derive(Clone, Debug)]

@@ -132,6 +132,7 @@ impl Sky {
                 let (is_sun, rest) = self.choose(*numbers);
                 rests[i] = rest;
                 many.set_sun(i, is_sun, rest);
+                // written before it is known whether it counts; the mask changes nothing, and tells the compiler that there is a place
                 of_dome[count & (MANY - 1)] = i;
                 count += usize::from(!is_sun);
             }
@@ -233,6 +234,23 @@ impl Dome {
 mod tests {
     use super::*;
     use crate::testing::Rng;
+
+    /// Every number stands for one part, in order, and what is left of it goes from the least to the most.
+    #[test]
+    fn what_is_left_of_a_choice_is_as_random() {
+        let world = World { environment: Some(Environment::Constant([1.0; 3])), ..World::default() };
+        for sun_end in [0, 1, 3, WHOLE / 8, WHOLE - 1, WHOLE] {
+            let sky = Sky { sun_end, ..Sky::new(&world, None) };
+            for (part, start, end) in [(true, 0, sun_end), (false, sun_end, WHOLE)] {
+                let Some(last) = end.checked_sub(1).filter(|last| *last >= start) else { continue };
+                assert_eq!(sky.choose([start as u32, 7]), (part, [0, 7]), "{sun_end}");
+                let (chosen, [rest, other]) = sky.choose([last as u32, 9]);
+                // the last of n numbers stands for the last n-th part
+                let most = ((last - start) << 32) / (end - start);
+                assert_eq!((chosen, u64::from(rest), other), (part, most, 9), "{sun_end}");
+            }
+        }
+    }
 
     /// Many at once are what each alone is, whatever the sky and however many.
     #[test]

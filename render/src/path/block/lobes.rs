@@ -23,7 +23,7 @@ macro_rules! each {
 impl Block {
     /// Notes the model of a vertex.
     #[inline(always)]
-    pub(super) fn look(&mut self, i: usize, look: &Look) {
+    pub(super) fn note_look(&mut self, i: usize, look: &Look) {
         match look {
             Look::Diffuse(reflectance) => self.reflectance.set(i, (*reflectance).into()),
             Look::Coat(coat) => {

@@ -259,6 +259,7 @@ impl Block {
     /// Adds a vertex of the ray at `index` of the batch, with a sibling's key and throughput. It passes through unless it is given a triangle.
     #[inline(always)]
     pub(super) fn push(&mut self, index: u32, key: PathKey, throughput: Vec3) {
+        debug_assert!(self.len < N, "a full block is flushed first");
         let i = self.len & (N - 1);
         self.index[i] = index;
         self.key[i] = key;
@@ -278,6 +279,7 @@ impl Block {
     /// The last vertex. The mask changes nothing, and tells the compiler that there is a place.
     #[inline(always)]
     fn last(&self) -> usize {
+        debug_assert!(self.len > 0, "a vertex is pushed first");
         self.len.wrapping_sub(1) & (N - 1)
     }
 
@@ -315,7 +317,7 @@ impl Block {
     pub(super) fn set_look(&mut self, shape: u32, look: &Look) {
         let i = self.last();
         self.shape[i] = shape;
-        self.look(i, look);
+        self.note_look(i, look);
     }
 
     /// It looks as textures say at a place, whose texels were asked for: they are read when the block is full. `first`: those of its first texture.
@@ -361,7 +363,7 @@ impl Block {
             if self.is_painted[i] && !self.passes[i] {
                 let material = &world.materials[world.shapes[self.shape[i] as usize].material as usize];
                 match material.look(&world.textures, context.textures, self.at[i], &self.spot[i]) {
-                    Some(look) => self.look(i, &look),
+                    Some(look) => self.note_look(i, &look),
                     None => self.passes[i] = true,
                 }
             }

@@ -145,6 +145,8 @@ fn motley() -> Scene {
 fn glossy() -> Scene {
     let mut scene = cornell::scene();
     let image = scene.image([2, 2], vec![200, 10, 30, 0, 90, 255, 128, 128, 128, 255, 255, 0]);
+    // of another size: what a look-up of one reads is not what that of the other reads
+    let other = scene.image([3, 1], vec![10, 250, 60, 90, 20, 200, 255, 130, 40]);
     let coat = |alpha: f32, eta: f32, nonlinear, distribution| Bsdf::RoughPlastic {
         distribution,
         alpha,
@@ -162,7 +164,7 @@ fn glossy() -> Scene {
         specular: [0.9, 1.0, 0.8],
     };
     let paint = |slots: &[Slot]| Detail {
-        textured: slots.iter().map(|&slot| Textured::new(slot, image)).collect(),
+        textured: slots.iter().zip([image, other]).map(|(&slot, image)| Textured::new(slot, image)).collect(),
         ..Detail::default()
     };
     let materials = [
