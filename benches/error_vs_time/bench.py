@@ -27,8 +27,8 @@ QUIET = 0.1
 # pixels of 65,536 that are left out of the error of each picture, the worst of it. One pixel of veach-mis shows a two-thousandth part of its smallest light: a render of
 # 16 samples hits it once in 120 times and is then wrong by a relMSE of 0.24, by whatever renderer, which would decide the mean of any number of repeats
 WORST = {"veach-mis": 16}
-# from which ray on Mitsuba's roulette ends paths where its 5 is not its best: error times CPU of 2, 3, 4, 5 and 8 was tried on each room (docs/benchmarks/tried.md)
-RR_DEPTH = {"living-room": 2}
+# from which ray on Mitsuba's roulette ends paths where its 5 is not its best: error times CPU from 2, 3, 4, 5 and 8 on was tried on these two (docs/benchmarks/tried.md)
+RR_DEPTH = {"living-room": 2, "staircase": 4}
 # sets of repeats from which an interval is made
 DRAWS = 1000
 SCENES = ["cornell", "gyroid", "staircase", "living-room", "veach-mis", "classroom", *scenes.MANY_LIGHTS, "ajar-door"]
