@@ -65,6 +65,10 @@ struct Wire<'a> {
     polls: AtomicU32,
     /// Attempts that were handed out before this stops being an operator.
     attempts: AtomicU32,
+    /// Those of them that were not reported yet, and whose they are.
+    in_hand: Mutex<BTreeMap<String, WorkerId>>,
+    /// The most that one worker had of them.
+    at_once: Arc<AtomicU32>,
 }
 
 fn over<T: serde::Serialize + serde::de::DeserializeOwned>(message: &T) -> T {
@@ -76,12 +80,19 @@ impl Link for Wire<'_> {
         self.polls.fetch_add(1, Ordering::Relaxed);
         let answer = self.runtime.block_on(self.fleet.poll(&over(poll), Duration::from_millis(200)));
         let answer = answer.map_err(|e| LinkError(e.to_string()))?;
-        if matches!(&answer, Answer::Work { work, .. } if matches!(**work, super::Work::Attempt { .. })) {
+        if let Answer::Work { id, work } = &answer
+            && matches!(**work, super::Work::Attempt { .. })
+        {
             self.attempts.fetch_add(1, Ordering::Relaxed);
+            let mut in_hand = self.in_hand.lock().unwrap();
+            in_hand.insert(id.clone(), poll.worker.clone());
+            let of_this = in_hand.values().filter(|worker| **worker == poll.worker).count();
+            self.at_once.fetch_max(of_this as u32, Ordering::Relaxed);
         }
         Ok(over(&answer))
     }
     fn report(&self, report: &Report) -> Result<(), LinkError> {
+        self.in_hand.lock().unwrap().remove(&report.id);
         self.fleet.report(over(report)).map(drop).map_err(|e| LinkError(e.to_string()))
     }
     fn beat(&self, beat: &Beat) -> Result<Vec<String>, LinkError> {
@@ -150,6 +161,7 @@ fn spec(strategy: Strategy, splits: i64, replicas: i32) -> RenderJobSpec {
     spec.image.aovs = (replicas == 2).then(|| Aov::ALL.to_vec());
     spec.sampling.spp = Some(6);
     spec.sampling.max_depth = Some(5);
+    spec.sampling.seed = Some(7);
     spec.task_seconds = Some(0.01);
     spec
 }
@@ -186,7 +198,8 @@ fn local_files(spec: &RenderJobSpec) -> (Vec<u8>, Vec<u8>, report::Report) {
     let made = prepare(&description, &source, &settings, &SpoolSettings::default(), objects.as_ref(), &NoProgress);
     let scene = PreparedScene::open(made.unwrap().manifest, objects).unwrap();
     let frame = from_spec::frame(spec, &scene.manifest, None).unwrap();
-    let sampling = Sampling { spp: 6, target_error: None, time_limit: None };
+    let spp = from_spec::samples(spec, &scene.manifest);
+    let sampling = Sampling { spp, target_error: spec.sampling.target_error, time_limit: None };
     let out = render_local(&scene, &frame, &sampling, &JobSettings::default(), &Silent).unwrap();
     let definition = from_spec::definition(&scene.manifest, &frame, out.spp).unwrap();
     let layers = out.film.channels(out.spp, scene.manifest.offset);
@@ -199,6 +212,10 @@ struct Cluster {
     runtime: Runtime,
     scratch: tempfile::TempDir,
     turns: Turns,
+    /// Of each worker.
+    slots: u32,
+    /// Most attempts that a worker had in hand at a time.
+    at_once: Arc<AtomicU32>,
     /// Tiles of a band, of four that the film has, without AOVs: with all of them it takes 11 for 3.
     band: u32,
     /// Primitives from which on all workers build a scene.
@@ -212,8 +229,9 @@ impl Cluster {
         let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build().unwrap();
         let memory = || Arc::new(Faulty::new(Arc::new(MemoryStore::default()), FaultPlan::default()));
         let stores = (0..nodes).map(|_| memory()).collect();
-        let (scratch, turns) = (tempfile::tempdir().unwrap(), Turns::default());
-        let cluster = Cluster { stores, runtime, scratch, turns, band: BAND, apart: APART, profile: false };
+        let (scratch, turns, at_once) = (tempfile::tempdir().unwrap(), Turns::default(), Arc::default());
+        let (slots, band, apart, profile) = (1, BAND, APART, false);
+        let cluster = Cluster { stores, runtime, scratch, turns, slots, at_once, band, apart, profile };
         cluster.runtime.block_on(cluster.stores[0].put(SOURCE, CORNELL.clone().into())).unwrap();
         cluster.runtime.block_on(cluster.stores[0].put(TEXTURE, wall().into())).unwrap();
         cluster
@@ -232,7 +250,7 @@ impl Cluster {
             depot,
             fleet,
             turns: &self.turns,
-            slots: vec![1; 3],
+            slots: vec![self.slots; 3],
             band: self.band,
             apart: self.apart,
             profile: self.profile,
@@ -243,10 +261,11 @@ impl Cluster {
         // the same path for all workers, as in their pods: it is part of a source's fingerprint
         let scratch = self.scratch.path().to_owned();
         let worker = WorkerId { number, session: session.into() };
-        Station::new(link, self.depot(home), 1, worker, scratch).unwrap()
+        Station::new(link, self.depot(home), self.slots, worker, scratch).unwrap()
     }
     fn wire<'a>(&self, fleet: &'a Fleet) -> Wire<'a> {
-        Wire { fleet, runtime: self.runtime.handle().clone(), polls: AtomicU32::new(0), attempts: AtomicU32::new(0) }
+        let (polls, attempts, in_hand, at_once) = (0.into(), 0.into(), Mutex::default(), self.at_once.clone());
+        Wire { fleet, runtime: self.runtime.handle().clone(), polls, attempts, in_hand, at_once }
     }
     /// No source is known by its listing any more: workers are asked.
     fn forget_sources(&self) {
@@ -255,6 +274,11 @@ impl Cluster {
             let names: Vec<String> = names.into_iter().map(|(key, _)| key).collect();
             self.runtime.block_on(store.delete(&names)).unwrap();
         }
+    }
+    /// All that lies below the job's prefix, on each store.
+    fn lies(&self) -> Vec<Vec<String>> {
+        let of = |store: &Arc<Faulty>| self.runtime.block_on(store.list("jobs/1/")).unwrap();
+        self.stores.iter().map(|store| of(store).into_iter().map(|(key, _)| key).collect()).collect()
     }
     fn picture(&self, store: usize) -> Vec<u8> {
         self.runtime.block_on(self.stores[store].get("out/a.exr")).unwrap().to_vec()

@@ -34,6 +34,11 @@ fn workers_and_operators_that_go_change_no_byte() {
     cluster.beside((&spec, &kept, "e2"), |job| job, |_, _| {}).unwrap();
     assert!(cluster.picture(2) == want);
     assert!(kept.reports.lock().unwrap()[0].tasks_reused > 0);
+    // each record lies on as many of the stores as there are to be copies
+    let mut copies: BTreeMap<String, u32> = BTreeMap::new();
+    let records = |key: &String| key.starts_with("jobs/1/0/records/");
+    cluster.lies().into_iter().flatten().filter(records).for_each(|key| *copies.entry(key).or_default() += 1);
+    assert!(copies.len() > 1 && copies.values().all(|&n| n == 2), "{copies:?}");
 }
 
 #[test]

@@ -4,19 +4,20 @@ use super::*;
 
 #[test]
 fn every_strategy_makes_the_bytes_of_a_local_run() {
-    for (strategy, splits, memory, band, layers) in [
-        (Strategy::Auto, 1, None, BAND, true),
-        (Strategy::Auto, 6, Some("64Ki"), 1, false),
-        (Strategy::DemandDriven, 4, None, 11, true),
-        (Strategy::SchedulingGrid, 4, None, 1, true),
-        (Strategy::SchedulingGridOverlapReduced, 4, None, BAND, false),
-        (Strategy::SchedulingGridOverlapReduced, 4, None, 2, false),
+    for (strategy, splits, memory, band, layers, slots) in [
+        (Strategy::Auto, 1, None, BAND, true, 1),
+        (Strategy::Auto, 6, Some("64Ki"), 1, false, 1),
+        (Strategy::Auto, 6, Some("64Ki"), 1, false, 2),
+        (Strategy::DemandDriven, 4, None, 11, true, 2),
+        (Strategy::SchedulingGrid, 4, None, 1, true, 1),
+        (Strategy::SchedulingGridOverlapReduced, 4, None, BAND, false, 2),
+        (Strategy::SchedulingGridOverlapReduced, 4, None, 2, false, 1),
     ] {
         let mut spec = spec(strategy, splits, 2);
         spec.image.aovs = spec.image.aovs.filter(|_| layers);
         spec.workers.memory = memory.map(|m: &str| m.parse().unwrap());
         let profile = splits > 1;
-        let (cluster, kept) = (Cluster { band, profile, ..Cluster::new(2) }, Arc::new(Kept::default()));
+        let (cluster, kept) = (Cluster { band, profile, slots, ..Cluster::new(2) }, Arc::new(Kept::default()));
         if let Err(e) = cluster.render(&spec, &kept) {
             panic!("{strategy}: {e}");
         }
@@ -29,11 +30,55 @@ fn every_strategy_makes_the_bytes_of_a_local_run() {
         assert!(cluster.picture(1) == cluster.picture(0));
         let reports = kept.reports.lock().unwrap();
         assert!(reports[0].tasks > 1 && reports[0].scene_passes > 0.0, "{:?}", reports[0]);
+        assert_eq!(cluster.at_once.load(Ordering::Relaxed), slots, "{strategy}: attempts in the hands of one worker");
+        // rays went from task to task, and none of their groups is left
+        assert_eq!(reports[0].hops > 0, splits > 1 && strategy != Strategy::DemandDriven, "{strategy}");
+        for lies in cluster.lies() {
+            let rays: Vec<&String> = lies.iter().filter(|key| key.contains("/rays/")).collect();
+            assert!(!lies.is_empty() && rays.is_empty(), "{strategy}: {rays:?}");
+        }
         assert_eq!(kept.pictures.lock().unwrap()[0].len(), 2);
         // what workers spent, of those of committed attempts, comes with their results
         let costs = reports[0].profile.map(|p| [Part::Shading, Part::Shadow].map(|part| p.of(part).items));
         assert_eq!(costs.is_some(), profile, "{strategy}");
         assert!(costs.is_none_or(|c| c[0] == reports[0].rays.closest && c[1] >= reports[0].rays.shadow), "{strategy}");
+    }
+}
+
+/// Of what may change while a job runs: whether all tasks of a round end before the next begins.
+#[test]
+fn a_job_goes_on_with_another_barrier() {
+    let mut spec = spec(Strategy::SchedulingGridOverlapReduced, 4, 2);
+    spec.task_seconds = Some(0.003);
+    for barrier in [true, false] {
+        let (cluster, kept) = (Cluster::new(3), Arc::new(Kept::default()));
+        spec.barrier = Some(barrier);
+        begun(&cluster, &spec, &kept, 6);
+        spec.barrier = Some(!barrier);
+        cluster.render(&spec, &kept).unwrap();
+        assert!(cluster.picture(0) == expected(&spec), "{barrier}");
+        let reports = kept.reports.lock().unwrap();
+        assert!(reports[0].tasks_reused >= 6 && reports[0].tasks > 0, "{barrier}: {:?}", reports[0]);
+    }
+}
+
+/// And the target error, also of a job that has reached the one before.
+#[test]
+fn a_job_whose_target_error_is_lowered_goes_on_from_where_it_ended() {
+    let mut spec = spec(Strategy::SchedulingGridOverlapReduced, 4, 2);
+    spec.sampling.spp = Some(1024);
+    let (cluster, kept) = (Cluster::new(3), Arc::new(Kept::default()));
+    let mut tasks = 0;
+    for target in [0.03, 0.006] {
+        spec.sampling.target_error = Some(target);
+        cluster.render(&spec, &kept).unwrap();
+        let (file, report) = local(&spec);
+        assert!(cluster.picture(0) == file, "{target}");
+        let last = kept.reports.lock().unwrap().last().unwrap().clone();
+        assert!(last.target_reached == Some(true) && last.spp < 1024, "{last:?}");
+        assert_eq!((last.spp, last.tasks_reused, last.tasks_redone), (report.spp, tasks, 0));
+        assert!(last.tasks > 0, "{target}: it was not reached before");
+        tasks = last.tasks;
     }
 }
 
