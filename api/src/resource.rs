@@ -179,6 +179,16 @@ mod tests {
         let names = &crd.spec.names;
         assert_eq!((names.plural.as_str(), names.short_names.clone()), ("renderjobs", Some(vec!["rj".to_owned()])));
         assert!(crd.spec.versions[0].subresources.as_ref().is_some_and(|s| s.status.is_some()));
+        // each column but the age shows a field that there is
+        let schema = crd.spec.versions[0].schema.as_ref().and_then(|s| s.open_api_v3_schema.as_ref()).unwrap();
+        let status = schema.properties.as_ref().and_then(|of| of["status"].properties.as_ref()).unwrap();
+        let columns = crd.spec.versions[0].additional_printer_columns.as_ref().unwrap();
+        let shown = columns.iter().map(|c| (c.name.as_str(), c.json_path.strip_prefix(".status."), c.type_.as_str()));
+        let (ages, fields): (Vec<_>, Vec<_>) = shown.partition(|(_, field, _)| field.is_none());
+        assert_eq!((ages, columns[5].json_path.as_str()), (vec![("Age", None, "date")], ".metadata.creationTimestamp"));
+        for (name, field, kind) in fields {
+            assert_eq!(status[field.unwrap()].type_.as_deref(), Some(kind), "{name}");
+        }
         for (path, ..) in RULES {
             let mut at =
                 &serde_json::to_value(&crd).unwrap()["spec"]["versions"][0]["schema"]["openAPIV3Schema"].clone();

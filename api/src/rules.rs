@@ -39,6 +39,8 @@ pub const RULES: &[Rule] = &[
     (SPEC, "!(has(self.blockSize) && has(self.splits))", "give blockSize or splits, not both"),
     (SPEC, same!("blockSize"), "spec.blockSize cannot be changed: make another job"),
     (SPEC, same!("splits"), "spec.splits cannot be changed: make another job"),
+    // what is written already would keep the copies that it has
+    (SPEC, same!("replicas"), "spec.replicas cannot be changed: make another job"),
     (SPEC, same!("overlapThreshold"), "spec.overlapThreshold cannot be changed: make another job"),
     (
         SPEC,

@@ -233,6 +233,9 @@ fn every_rule_refuses_what_it_is_for_with_its_message_and_nothing_else() {
     for (path, value, message) in [
         ("/splits", json!(33), "spec.splits cannot be changed"),
         ("/splits", json!(null), "spec.splits cannot be changed"),
+        ("/replicas", json!(3), "spec.replicas cannot be changed"),
+        ("/replicas", json!(1), "spec.replicas cannot be changed"),
+        ("/replicas", json!(null), "spec.replicas cannot be changed"),
         ("/overlapThreshold", json!(0.3), "spec.overlapThreshold cannot be changed"),
         ("/scene/source", json!("other"), "the scene of a job cannot be changed"),
         ("/scene/iso", json!(1), "the scene of a job cannot be changed"),
@@ -292,6 +295,7 @@ fn what_may_change_while_a_job_runs_may() {
         ("/image/exposure", json!(2)),
         ("/image/files", json!(["Exr", "Png"])),
         ("/strategy", json!("DemandDriven")),
+        ("/barrier", json!(true)),
         ("/workers/slots", json!([3])),
         ("/workers/memory", json!(1 << 30)),
         ("/workers/keepWarmSeconds", json!(60)),
