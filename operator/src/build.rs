@@ -466,6 +466,12 @@ mod tests {
         let affinity = spec.affinity.unwrap();
         let terms = affinity.node_affinity.unwrap().preferred_during_scheduling_ignored_during_execution.unwrap();
         assert_eq!(terms.iter().map(|t| t.weight).collect::<Vec<_>>(), [100, 1]);
+        // and away from the job's other workers
+        let apart = affinity.pod_anti_affinity.unwrap().preferred_during_scheduling_ignored_during_execution.unwrap();
+        let [other] = &apart[..] else { panic!("{apart:?}") };
+        let selector = other.pod_affinity_term.label_selector.as_ref().unwrap();
+        assert_eq!((other.weight, other.pod_affinity_term.topology_key.as_str()), (100, "kubernetes.io/hostname"));
+        assert_eq!(selector.match_labels, Some([(LABEL.to_owned(), "u-1".to_owned())].into()));
         let owner = &pod.metadata.owner_references.unwrap()[0];
         assert_eq!((owner.uid.as_str(), owner.controller), ("u-1", Some(true)));
     }
@@ -484,6 +490,8 @@ mod tests {
             let found = made.pointer(&format!("{nodes}{value}"));
             assert_eq!(found, (placement != Placement::None).then(|| json!(["node2"])).as_ref(), "{placement:?}");
             assert!(made.pointer(&format!("{nodes}/1")).is_none());
+            // more than one of them are spread, wherever they may be
+            assert!(made.pointer("/spec/affinity/podAntiAffinity").is_some(), "{placement:?}");
             assert!(!made.to_string().contains("nodeSelectorTerms"), "where its blocks will lie is not known");
             // so it may be made anew there, when that is known
             assert_eq!(made["metadata"]["labels"][PLACED], json!("false"));

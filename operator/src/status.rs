@@ -336,8 +336,10 @@ mod tests {
         three.spec.image.cameras = serde_json::from_value(json!([camera, camera, camera])).unwrap();
         let mut state = State { scene: Some("s".into()), ..State::default() };
         (state.status.samples, state.status.samples_total) = (50, 100);
+        (state.status.rounds, state.status.waiting) = (3, 4000);
         let told = |state: &State| of(&three, state, &Tally::default(), 1, true, at(0));
         assert_eq!(told(&state).progress.as_deref(), Some("16%"));
+        assert_eq!((told(&state).rounds, told(&state).rays_waiting), (Some(3), Some(4000)));
         state.status.rays.closest = 7;
         state.status.samples = 100;
         let report = Report { rays: state.status.rays, ..Report::default() };

@@ -117,6 +117,10 @@ pub async fn credentials(
 
 #[cfg(test)]
 mod tests {
+    use std::time::Duration;
+
+    use hyper::{Request, Response};
+    use kube::client::Body;
     use serde_json::json;
 
     use super::*;
@@ -136,6 +140,29 @@ mod tests {
         let storage = |endpoints| Storage { bucket: "b".into(), region: "r".into(), endpoints, ..Storage::default() };
         assert!(is_local(&storage(found)), "the one that is away makes no other far");
         assert!(!is_local(&storage(vec![Endpoint { url: "https://s3".into(), node: None }])));
+    }
+
+    /// Whatever the environment of this process says: the same of the operator's identity as without a job, and no Secret is read.
+    #[tokio::test]
+    async fn a_storage_of_a_clouds_identity_needs_no_secret() {
+        let (service, mut server) = tower_test::mock::pair::<Request<Body>, Response<Body>>();
+        let client = Client::new(service, "default");
+        let found = Storage { identity: true, ..Storage::default() };
+        let told = credentials(&client, "studio", &StorageSpec::default(), &found);
+        let told = tokio::time::timeout(Duration::from_secs(20), told).await.expect("nobody is asked");
+        let own = S3Credentials::identity().map_err(|e| format!("the operator: {e}"));
+        assert_eq!(told.map_err(|e| e.to_string()), own);
+        let asked = tokio::time::timeout(Duration::from_millis(100), server.next_request()).await;
+        assert!(asked.is_err(), "a request to the API server");
+        // without one it is read
+        let of_key = Storage::default();
+        let keys = credentials(&client, "studio", &StorageSpec::default(), &of_key);
+        tokio::select! {
+            _ = keys => panic!("nobody has answered"),
+            asked = server.next_request() => {
+                assert!(asked.unwrap().0.uri().path().ends_with("/namespaces/studio/secrets/rayherd-storage"));
+            }
+        }
     }
 
     #[test]

@@ -219,6 +219,8 @@ async fn workers_are_kept_warm_when_that_is_asked_for() {
         let mut asked = job();
         asked["spec"]["workers"]["keepWarmSeconds"] = json!(warm);
         let mut bench = Bench::begun(asked).await;
+        let is_told = |bench: &Bench| bench.context.metrics.text().unwrap().contains("job=\"box\"");
+        assert!(is_told(&bench));
         bench.running().lock().end = Some((Timestamp::now(), Ok(())));
         let mut steps = vec![
             step("PATCH", STATUS, 200, bench.job.clone())
@@ -233,17 +235,19 @@ async fn workers_are_kept_warm_when_that_is_asked_for() {
         if warm.is_none() {
             assert_eq!(done, Ok(Action::await_change()));
             assert!(bench.context.jobs.get("u-1").is_none());
+            assert!(!is_told(&bench), "the job stays, and its labels do not");
             continue;
         }
         assert_eq!(done, Ok(Action::requeue(Duration::from_secs(600))));
         let (done, _) = bench.step(vec![]).await;
         assert_ne!(done.unwrap(), Action::await_change(), "they wait, in silence");
-        assert!(bench.context.jobs.get("u-1").is_some());
+        assert!(bench.context.jobs.get("u-1").is_some() && is_told(&bench));
         // their time is over
         bench.job["status"]["completionTime"] = json!("2026-01-01T00:00:00Z");
         let (done, _) =
             bench.step(vec![step("GET", PODS, 200, list(vec![pod(0, json!([]))])), deleted("box-w0")]).await;
         assert_eq!(done, Ok(Action::await_change()));
+        assert!(!is_told(&bench));
     }
 }
 
