@@ -177,10 +177,29 @@ def namespaced(r, _):
 
 
 def policies(r, _):
+    def within(namespace):
+        return {"namespaceSelector": {"matchLabels": {"kubernetes.io/metadata.name": namespace}}}
+
+    operators = {"matchLabels": {"app.kubernetes.io/name": "rayherd", "app.kubernetes.io/instance": "rayherd"}}
+    worker_pods = {"matchLabels": {"app.kubernetes.io/name": "rayherd-worker"}}
     workers = r.one("NetworkPolicy", "rayherd-workers", JOBS)["spec"]
+    assert workers["podSelector"] == worker_pods, workers
     assert workers["policyTypes"] == ["Ingress", "Egress"] and "ingress" not in workers
     assert [p["port"] for e in workers["egress"] for p in e.get("ports", [])] == [53, 53, "tasks", 9000]
-    assert workers["egress"][-1]["to"] == [{"ipBlock": {"cidr": "10.0.0.0/8"}}]
+    # a peer that lacks is everybody: the name service's alone
+    assert [e.get("to") for e in workers["egress"]] == [
+        None,
+        [{**within(OWN), "podSelector": operators}],
+        [within(STORE)],
+        [{"ipBlock": {"cidr": "10.0.0.0/8"}}],
+    ], workers
+    operator = r.one("NetworkPolicy", "rayherd-operator")["spec"]
+    assert operator["podSelector"] == operators and operator["policyTypes"] == ["Ingress"], operator
+    # workers of every namespace, and of the metrics everybody
+    assert [i.get("from") for i in operator["ingress"]] == [
+        [{"namespaceSelector": {}, "podSelector": worker_pods}],
+        None,
+    ], operator
 
 
 def no_policies(r, _):
