@@ -6,6 +6,8 @@
 mod beckmann;
 mod conductor;
 mod detail;
+#[cfg(test)]
+mod detail_tests;
 mod dielectric;
 mod diffuse;
 mod gloss;

@@ -77,44 +77,75 @@ fn bitmaps_in_both_spellings() {
     assert_eq!(map, [[3.0, 0.0, 0.3], [0.0, 5.0, 1.0]].map(|row| row.map(|x: f64| x as f32)));
 }
 
+/// By model every parameter that takes a texture, and the slot that it goes to; which field of the model a slot gives is `render`'s to know
+/// (`a_texture_reaches_its_parameter_alone`).
+const PARAMETERS: &[(&str, &[(&str, Slot)])] = &[
+    ("diffuse", &[("reflectance", Slot::Diffuse), ("diffuse_reflectance", Slot::Diffuse)]),
+    ("conductor", &[("specular_reflectance", Slot::Specular)]),
+    ("roughconductor", &[("specular_reflectance", Slot::Specular), ("alpha", Slot::Alpha)]),
+    ("roughconductor", &[("alpha_u", Slot::AlphaU), ("alpha_v", Slot::AlphaV)]),
+    ("dielectric", &[("specular_reflectance", Slot::Specular), ("specular_transmittance", Slot::Transmit)]),
+    ("thindielectric", &[("specular_reflectance", Slot::Specular), ("specular_transmittance", Slot::Transmit)]),
+    ("roughdielectric", &[("specular_reflectance", Slot::Specular), ("specular_transmittance", Slot::Transmit)]),
+    ("roughdielectric", &[("alpha", Slot::Alpha)]),
+    ("roughdielectric", &[("alpha_u", Slot::AlphaU), ("alpha_v", Slot::AlphaV)]),
+    ("plastic", &[("diffuse_reflectance", Slot::Diffuse), ("specular_reflectance", Slot::Specular)]),
+    ("roughplastic", &[("diffuse_reflectance", Slot::Diffuse), ("specular_reflectance", Slot::Specular)]),
+    ("phong", &[("diffuse_reflectance", Slot::Diffuse), ("specular_reflectance", Slot::Specular)]),
+    (
+        "principled",
+        &[
+            ("base_color", Slot::Diffuse),
+            ("roughness", Slot::Roughness),
+            ("anisotropic", Slot::Anisotropic),
+            ("metallic", Slot::Metallic),
+            ("spec_trans", Slot::SpecTrans),
+            ("spec_tint", Slot::SpecTint),
+            ("sheen", Slot::Sheen),
+            ("sheen_tint", Slot::SheenTint),
+            ("clearcoat", Slot::Clearcoat),
+            ("clearcoat_gloss", Slot::ClearcoatGloss),
+            ("flatness", Slot::Flatness),
+        ],
+    ),
+];
+
+/// A name as 0.5 and 0.6 have it.
+fn camel(name: &str) -> String {
+    let mut words = name.split('_');
+    let first = words.next().unwrap_or_default().to_owned();
+    words.fold(first, |out, word| out + &word[..1].to_uppercase() + &word[1..])
+}
+
 #[test]
 fn every_parameter_that_takes_one() {
-    let t = |name| bitmap(name, "");
-    for (bsdf, slots) in [
-        (format!("<bsdf type=\"conductor\">{}", t("specularReflectance")), vec![Slot::Specular]),
-        (
-            format!("<bsdf type=\"roughconductor\">{}{}", t("specular_reflectance"), t("alpha")),
-            vec![Slot::Specular, Slot::Alpha],
-        ),
-        (
-            format!("<bsdf type=\"roughconductor\">{}<float name=\"alpha_v\" value=\"0.3\"/>", t("alpha_u")),
-            vec![Slot::AlphaU],
-        ),
-        (
-            format!("<bsdf type=\"dielectric\">{}{}", t("specular_reflectance"), t("specular_transmittance")),
-            vec![Slot::Specular, Slot::Transmit],
-        ),
-        (format!("<bsdf type=\"roughdielectric\">{}", t("alpha")), vec![Slot::Alpha]),
-        (
-            format!("<bsdf type=\"plastic\">{}{}", t("diffuse_reflectance"), t("specular_reflectance")),
-            vec![Slot::Diffuse, Slot::Specular],
-        ),
-        (format!("<bsdf type=\"roughplastic\">{}", t("diffuseReflectance")), vec![Slot::Diffuse]),
-    ] {
-        let out = scene(&shape(&format!("{bsdf}</bsdf>")));
-        // one file looked at one way is one texture
-        assert_eq!(out.textures.len(), 1, "{bsdf}");
-        let expected: Vec<Textured> = slots.into_iter().map(|s| textured(s, 0)).collect();
-        assert_eq!(detail(&out.materials[0]).textured, expected, "{bsdf}");
-        let mut model = out.materials[0].bsdf.clone();
-        for t in expected {
-            let there = match t.slot {
-                Slot::Diffuse | Slot::Specular | Slot::Transmit => model.color_mut(t.slot).is_some(),
-                _ => model.alpha_mut().is_some(),
-            };
-            assert!(there, "{model:?} has no {:?}", t.slot);
+    for (plugin, parameters) in PARAMETERS {
+        for spelling in [str::to_owned, camel] {
+            for (name, slot) in *parameters {
+                // the other roughness must be there
+                let other = match *slot {
+                    Slot::AlphaU => "<float name=\"alpha_v\" value=\"0.3\"/>",
+                    Slot::AlphaV => "<float name=\"alpha_u\" value=\"0.3\"/>",
+                    _ => "",
+                };
+                let bsdf = format!("<bsdf type=\"{plugin}\">{}{other}</bsdf>", bitmap(&spelling(name), ""));
+                let out = scene(&shape(&bsdf));
+                assert_eq!(detail(&out.materials[0]).textured, [textured(*slot, 0)], "{bsdf}");
+                let mut model = out.materials[0].bsdf.clone();
+                let there = match slot {
+                    Slot::Diffuse | Slot::Specular | Slot::Transmit => model.color_mut(*slot).is_some(),
+                    Slot::Alpha | Slot::AlphaU | Slot::AlphaV => model.alpha_mut().is_some(),
+                    _ => model.number_mut(*slot).is_some(),
+                };
+                assert!(there, "{model:?} has no {slot:?}");
+            }
         }
     }
+    // one file looked at one way is one texture
+    let both: String = ["specular_reflectance", "alpha"].map(|name| bitmap(name, "")).concat();
+    let out = scene(&shape(&format!("<bsdf type=\"roughconductor\">{both}</bsdf>")));
+    assert_eq!(detail(&out.materials[0]).textured, [textured(Slot::Specular, 0), textured(Slot::Alpha, 0)]);
+    assert_eq!(out.textures.len(), 1);
     let named = format!(
         "{}<bsdf type=\"diffuse\" id=\"m\"><ref name=\"reflectance\" id=\"t\"/></bsdf>{}",
         bitmap("", "").replace("<texture", "<texture id=\"t\""),
