@@ -276,6 +276,42 @@ mod tests {
         Hit { t: 1.0, u, v, prim: 0, leaf: 0, lane: 0 }
     }
 
+    /// Coordinates and attribute at a hit are the corners' by their shares of the triangle: a corner's is that of the part across from it.
+    #[test]
+    fn places_are_weighted_by_area() {
+        let mut rng = Rng(14);
+        for _ in 0..2000 {
+            let p = [rng.vec3(1.0), rng.vec3(1.0), rng.vec3(1.0)];
+            let [a, b, c] = p.map(Vec3::as_dvec3);
+            let whole = (b - a).cross(c - a);
+            if whole.length() < 0.05 {
+                continue;
+            }
+            let (s, t) = (rng.f32(), rng.f32());
+            let [u, v] = if s + t < 1.0 { [s, t] } else { [1.0 - s, 1.0 - t] };
+            let uv = [0, 1, 2].map(|_| [rng.range(-3.0, 3.0), rng.range(-3.0, 3.0)]);
+            let attribute = [0, 1, 2].map(|_| rng.vec3(5.0).to_array());
+            let geometry = Primitive::Triangle(p.map(|v| v.to_array()));
+            let surface = Surface { geometry, normals: None, uv: Some(uv), attribute: Some(attribute) };
+            let at = triangle_place(&surface, &hit(u, v));
+            // the kernel's u and v are the shares of the second and the third corner
+            let place = a + f64::from(u) * (b - a) + f64::from(v) * (c - a);
+            let share = |from: DVec3, to: DVec3| (from - place).cross(to - place).dot(whole) / whole.length_squared();
+            let shares = [share(b, c), share(c, a), share(a, b)];
+            for k in 0..2 {
+                let expected: f64 = (0..3).map(|i| shares[i] * f64::from(uv[i][k])).sum();
+                assert!((f64::from(at.uv[k]) - expected).abs() < 1e-5, "{uv:?} {shares:?}: {:?}", at.uv);
+            }
+            for k in 0..3 {
+                let expected: f64 = (0..3).map(|i| shares[i] * f64::from(attribute[i][k])).sum();
+                assert!((f64::from(at.attribute[k]) - expected).abs() < 1e-5, "{attribute:?} {shares:?}: {at:?}");
+            }
+            // without any
+            let bare = triangle_place(&Surface { uv: None, attribute: None, ..surface }, &hit(u, v));
+            assert_eq!((bare.uv, bare.attribute), ([u, v], Vec3::ZERO));
+        }
+    }
+
     /// A bumped normal is that of the surface raised by the height, which is linear in u and v; seen from behind its other side, or its mirror image.
     #[test]
     fn bumps_are_normals_of_raised_surfaces() {

@@ -236,6 +236,63 @@ fn values_are_mitsubas() {
     }
 }
 
+/// The squares in f64: by which half of the mapped unit square each coordinate lies in.
+#[test]
+fn squares_are_the_definition() {
+    let mut rng = Rng(12);
+    let (mut compared, mut seen) = (0, [0; 2]);
+    for _ in 0..40 {
+        let colors = [0, 1].map(|_| [rng.f32() * 2.0, rng.f32(), rng.f32()]);
+        let to_uv = UvMap([0, 1].map(|_| [rng.range(-6.0, 6.0), rng.range(-6.0, 6.0), rng.range(-2.0, 2.0)]));
+        let texture = Texture::Checkerboard(Checkerboard { to_uv, colors });
+        for _ in 0..200 {
+            let uv = [rng.range(-2.0, 3.0), rng.range(-2.0, 3.0)];
+            let halves = to_uv.0.map(|row| {
+                let [a, b, c] = row.map(f64::from);
+                2.0 * (a * f64::from(uv[0]) + b * f64::from(uv[1]) + c)
+            });
+            // a coordinate of at most 32 is rounded thrice to 2^-24 of it
+            if halves.iter().any(|h| (h - h.round()).abs() < 1e-4) {
+                continue;
+            }
+            let odd = (halves[0].floor() + halves[1].floor()).rem_euclid(2.0) as usize;
+            assert_eq!(texture.color(&NoTextures, At::uv(uv)).to_array(), colors[odd], "{texture:?} {uv:?}");
+            // of a number that of the other square
+            let amount = texture.amount(&NoTextures, At::uv(uv));
+            let expected: f64 =
+                [0.2126, 0.7152, 0.0722].iter().zip(colors[1 - odd]).map(|(w, c)| w * f64::from(c)).sum();
+            assert!((f64::from(amount) - expected).abs() < 1e-6, "{texture:?} {uv:?}: {amount} {expected}");
+            assert_eq!(texture.gradient(&NoTextures, uv), [0.0; 2]);
+            seen[odd] += 1;
+            compared += 1;
+        }
+    }
+    assert!(compared > 7900 && seen.iter().all(|n| *n > 3000), "{compared} {seen:?}");
+}
+
+/// A mesh's attribute is what it is at the place, times the scale, wherever the coordinates are; its number is the luminance, as light it is not negative.
+#[test]
+fn attributes_are_scaled() {
+    let mut rng = Rng(13);
+    for _ in 0..1000 {
+        let scale = rng.range(-1.0, 3.0);
+        let texture = Texture::Attribute { scale };
+        let at = At { uv: [rng.range(-9.0, 9.0), rng.range(-9.0, 9.0)], attribute: rng.vec3(4.0) };
+        let expected = at.attribute.as_dvec3() * f64::from(scale);
+        let close = |found: f32, expected: f64| (f64::from(found) - expected).abs() <= 2e-6;
+        let (color, light) = (texture.color(&NoTextures, at), texture.light(&NoTextures, at));
+        for c in 0..3 {
+            assert!(
+                close(color[c], expected[c]) && close(light[c], expected[c].max(0.0)),
+                "{texture:?} {at:?}: {color}"
+            );
+        }
+        let luminance = 0.2126 * expected.x + 0.7152 * expected.y + 0.0722 * expected.z;
+        assert!(close(texture.amount(&NoTextures, at), luminance), "{texture:?} {at:?}");
+        assert_eq!(texture.gradient(&NoTextures, at.uv), [0.0; 2]);
+    }
+}
+
 /// Coordinates that say nothing, and tiles that are not there, are no panic.
 #[test]
 fn nonsense_has_a_value() {
