@@ -14,10 +14,11 @@ pub(super) struct Metal {
     pub k: [f32; 3],
 }
 
-/// The metal of a name; `X_palik` is `X` where the two are one measurement.
+/// The metal of a name; `X_palik` is `X` where the two are one measurement. `X-e` is a crystal's extraordinary ray.
 pub(super) fn find(name: &str) -> Option<Metal> {
     let by_name = |name: &str| METALS.iter().find(|m| m.name == name).copied();
-    by_name(name).or_else(|| by_name(name.strip_suffix("_palik")?).filter(|m| !NOT_PALIK.contains(&m.name)))
+    let twice = |m: &Metal| !NOT_PALIK.contains(&m.name) && !m.name.ends_with("_palik");
+    by_name(name).or_else(|| by_name(name.strip_suffix("_palik")?).filter(twice))
 }
 
 /// Metals without a measurement of this name's suffix.
@@ -51,14 +52,17 @@ const METALS: &[Metal] = &[
     Metal { name: "Ni_palik", eta: [2.3673046, 1.6633731, 1.4670781], k: [4.4988117, 3.050153, 2.3454392] },
     Metal { name: "Rh", eta: [2.5857935, 1.8602164, 1.5542634], k: [6.7822604, 4.702987, 3.976073] },
     Metal { name: "Se", eta: [4.0583115, 2.842935, 2.8208535], k: [0.75404954, 0.6384435, 0.52180755] },
+    Metal { name: "Se-e", eta: [5.722849, 4.165736, 4.0813384], k: [0.8711363, 1.1051575, 1.5653203] },
     Metal { name: "SiC", eta: [3.1723416, 2.5259717, 2.4793706], k: [7.5376636e-07, 0.0, 1.0192531e-05] },
     Metal { name: "SnTe", eta: [4.5242496, 1.981645, 1.2815913], k: [0.0, 0.0, 0.0] },
     Metal { name: "Ta", eta: [2.062721, 2.3929389, 2.6279287], k: [2.4083598, 1.7414864, 1.9470278] },
     Metal { name: "Te", eta: [7.3902335, 4.482105, 2.637106], k: [3.2560222, 3.5270588, 3.2920542] },
+    Metal { name: "Te-e", eta: [7.508907, 4.2964287, 2.3699877], k: [5.5839286, 4.947205, 3.9975922] },
     Metal { name: "ThF4", eta: [1.8307136, 1.4422286, 1.3876476], k: [0.0, 0.0, 0.0] },
     Metal { name: "TiC", eta: [3.7005284, 2.8374221, 2.582287], k: [3.265635, 2.3515892, 2.1727905] },
     Metal { name: "TiN", eta: [1.6484497, 1.150516, 1.3798234], k: [3.368328, 1.9434981, 1.1020677] },
     Metal { name: "TiO2", eta: [3.45661, 2.8017359, 2.905175], k: [0.00010526484, 0.0, 0.0006528865] },
+    Metal { name: "TiO2-e", eta: [3.1065645, 2.5131683, 2.5824444], k: [2.9751605e-05, 0.0, 0.00018269809] },
     Metal { name: "VC", eta: [3.657566, 2.752736, 2.532672], k: [3.0683007, 2.1986873, 1.9631927] },
     Metal { name: "V_palik", eta: [4.277582, 3.5129488, 2.7610714], k: [3.4913008, 2.8894548, 3.111522] },
     Metal { name: "VN", eta: [2.8656023, 2.119189, 1.9400911], k: [3.0322425, 2.0561156, 1.6163063] },

@@ -293,6 +293,8 @@ mod daylight_tests;
 #[cfg(test)]
 mod emitter_tests;
 #[cfg(test)]
+mod named_tests;
+#[cfg(test)]
 mod passed_over_tests;
 #[cfg(test)]
 mod sensor_tests;
