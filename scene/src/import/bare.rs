@@ -74,15 +74,17 @@ pub(super) fn meshes(
                 unsupported.append(&mut libraries.unsupported);
             }
             MeshFormat::Ply if looks => {
-                let (found, bytes) = super::ply::colors(path)?;
-                out.bytes_read += bytes;
-                attribute = found;
+                let found = super::ply::looks(path)?;
+                out.bytes_read += found.bytes_read;
+                attribute = found.colors;
+                let text = "the texture that the ply names is passed over: write an obj whose material has it, or a scene whose bsdf has it";
+                out.notes.extend(found.texture.map(|place| Note { place, text: text.into() }));
             }
             MeshFormat::Stl if looks => {
                 let head = passed_over(path, format);
                 out.bytes_read += head.bytes_read;
                 let place = Place::file(path);
-                out.notes.extend(head.colors.map(|text| Note { place, text: text.into() }));
+                out.notes.extend(head.looks.iter().map(|&text| Note { place: place.clone(), text: text.into() }));
             }
             _ => {}
         }

@@ -32,8 +32,8 @@ pub(super) struct ObjReader {
     polygon: Vec<Corner>,
     fanned: usize,
     line: Vec<u8>,
-    /// Whether the line is several of the file's.
-    continued: bool,
+    /// Where in it each of the file's lines begins, but the first: of a line that goes on in others.
+    joints: Vec<usize>,
     /// Whether anything was read that an OBJ file has.
     recognized: bool,
     parts: Option<PartNumbers>,
@@ -55,8 +55,8 @@ pub(super) struct Face {
     part: u32,
 }
 
-/// A `mtllib` statement: what it says, and the line.
-pub(super) type LibraryNames = Vec<(String, u32)>;
+/// A `mtllib` statement: what it says, the line, and how many bytes of that stand before it.
+pub(super) type LibraryNames = Vec<(String, u32, usize)>;
 
 /// What stands before and in a file's first vertex.
 pub(super) struct Head {
@@ -89,7 +89,10 @@ pub(super) fn head(path: &Path) -> Result<Head, ImportError> {
         let line = reader.line.trim_ascii_start();
         let (keyword, rest) = line.split_at(line.iter().position(u8::is_ascii_whitespace).unwrap_or(line.len()));
         match keyword {
-            b"mtllib" => out.libraries.push((name_of(rest), reader.source.place().1)),
+            b"mtllib" => {
+                let (line, at) = reader.place(reader.line.len() - rest.trim_ascii_start().len());
+                out.libraries.push((name_of(rest), line, at));
+            }
             b"v" => {
                 let words = rest.split(|b| b.is_ascii_whitespace()).filter(|w| !w.is_empty());
                 out.numbers = words.take_while(|w| w[0] != b'#').count();
@@ -129,34 +132,36 @@ impl ObjReader {
             polygon: vec![],
             fanned: 0,
             line: vec![],
-            continued: false,
+            joints: vec![],
             recognized: false,
             parts: parts.map(numbers),
             part: 0,
         }
     }
 
-    /// The part of what follows.
-    fn use_material(&mut self, rest: &[u8]) -> Result<(), ImportError> {
+    /// The part of what follows; its name stands at this byte of the line.
+    fn use_material(&mut self, rest: &[u8], at: usize) -> Result<(), ImportError> {
         let Some(parts) = &self.parts else { return Ok(()) };
         let name = name_of(rest);
         self.part = match parts.by_name.get(name.as_bytes()) {
             Some(&part) => part,
             None if parts.parts.lenient || parts.parts.libraries.is_empty() => 0,
             None => {
-                return self.source.fail_line(format!(
+                let message = format!(
                     "usemtl \"{name}\", which no mtllib of this file defines: add it there, or pass --albedo to use no materials"
-                ));
+                );
+                return self.fail_at(at, message);
             }
         };
         Ok(())
     }
 
     /// Libraries are read before the file is.
-    fn library(&self, rest: &[u8]) -> Result<(), ImportError> {
+    fn library(&self, rest: &[u8], at: usize) -> Result<(), ImportError> {
         let name = name_of(rest);
         match &self.parts {
-            Some(parts) if !parts.parts.lenient && !parts.parts.libraries.contains(&name) => self.source.fail_line(
+            Some(parts) if !parts.parts.lenient && !parts.parts.libraries.contains(&name) => self.fail_at(
+                at,
                 format!("mtllib \"{name}\" stands after the first vertex, face or usemtl: move it to the top of the file, or pass --albedo to use no materials"),
             ),
             _ => Ok(()),
@@ -166,18 +171,25 @@ impl ObjReader {
     /// Reads a line with its continuations into `self.line`; false at the end.
     fn read_line(&mut self) -> Result<bool, ImportError> {
         self.line.clear();
-        self.continued = false;
+        self.joints.clear();
         loop {
-            let Some(part) = self.source.line_bytes()? else { return Ok(!self.line.is_empty()) };
+            let Some(part) = self.source.line_bytes()? else {
+                // the last one ends in a backslash
+                self.joints.pop();
+                return Ok(!self.line.is_empty());
+            };
             let Some(part) = part.strip_suffix(b"\\") else {
                 self.line.extend_from_slice(part);
                 return Ok(true);
             };
             self.line.extend_from_slice(part);
             self.line.push(b' ');
-            self.continued = true;
+            self.joints.push(self.line.len());
             if self.line.len() > MAX_LINE {
-                return self.source.fail_line(format!("a line longer than {MAX_LINE} bytes with its continuations"));
+                let message = format!(
+                    "a line longer than {MAX_LINE} bytes with its continuations: this is no OBJ file, or it is broken"
+                );
+                return self.source.fail_at(0, message);
             }
         }
     }
@@ -194,8 +206,11 @@ impl ObjReader {
                 b"vt" => self.texture_coordinate(words)?,
                 b"vn" => self.normal(words)?,
                 b"f" => self.face(words)?,
-                b"usemtl" => self.use_material(after(&line, keyword))?,
-                b"mtllib" => self.library(after(&line, keyword))?,
+                b"usemtl" | b"mtllib" => {
+                    words.next();
+                    let (rest, at) = (after(&line, keyword), words.at());
+                    if keyword == b"usemtl" { self.use_material(rest, at)? } else { self.library(rest, at)? }
+                }
                 _ => {}
             }
             self.line = line;
@@ -208,7 +223,7 @@ impl ObjReader {
             }
         }
         if !self.recognized && self.positions.len() == 0 {
-            return self.source.fail_line("no vertex and no face in this file: it is no OBJ file, or it is empty");
+            return self.source.fail_in(1, 0, "no vertex and no face in this file: it is no OBJ file, or it is empty");
         }
         Ok(false)
     }
@@ -231,9 +246,22 @@ impl ObjReader {
         self.normals.push(n, &mut self.budget).map_err(|e| self.source.io(e))
     }
 
+    /// The line of the file, and the byte of it, that a byte of the line with its continuations is.
+    fn place(&self, at: usize) -> (u32, usize) {
+        let before = self.joints.partition_point(|&joint| joint <= at);
+        let start = if before == 0 { 0 } else { self.joints[before - 1] };
+        (self.source.place().1 - (self.joints.len() - before) as u32, at - start)
+    }
+
+    /// An error at a byte of the line with its continuations.
+    fn fail_at<T>(&self, at: usize, message: String) -> Result<T, ImportError> {
+        let (line, at) = self.place(at);
+        self.source.fail_in(line, at, message)
+    }
+
     /// An error at the last word.
     fn fail_word<T>(&self, words: &Words, message: String) -> Result<T, ImportError> {
-        if self.continued { self.source.fail_line(message) } else { self.source.fail_at(words.at(), message) }
+        self.fail_at(words.at(), message)
     }
 
     /// The first `N` numbers of a line, of which `least` must be there (others are 0).
@@ -253,7 +281,12 @@ impl ObjReader {
                             .fail_word(&words, format!("\"{}\" where a number of {keyword} should be", show(word)));
                     }
                 },
-                None if i < least => return self.source.fail_line(format!("{keyword} needs {least} number(s)")),
+                None if i < least => {
+                    let message = format!(
+                        "{keyword} needs {least} number(s) and has {i}: the line is cut off, export the file again"
+                    );
+                    return self.fail_word(&words, message);
+                }
                 None => break,
             }
         }
@@ -297,7 +330,10 @@ impl ObjReader {
                 .fail_limit(format!("more than {NONE} of one kind of vertex: cut the mesh into several files")),
             _ => {
                 let name = ["v", "vt", "vn"][kind];
-                self.fail_word(words, format!("index {value} of {name}, but {seen} of them stand above"))
+                let message = format!(
+                    "index {value} of {name}, but {seen} of them stand above: a face names what stands before it, from 1, or from -1 backwards"
+                );
+                self.fail_word(words, message)
             }
         }
     }

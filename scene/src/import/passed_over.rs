@@ -10,8 +10,8 @@ use crate::description::MeshFormat;
 /// What the head of a mesh says.
 #[derive(Default)]
 pub(super) struct PassedOver {
-    /// Colours (or weights) that are not read, as a note has it.
-    pub colors: Option<&'static str>,
+    /// Colours, weights or textures that are not read, as notes have it.
+    pub looks: Vec<&'static str>,
     /// Whether an OBJ file names material libraries.
     pub libraries: bool,
     /// Bytes read to know.
@@ -20,19 +20,22 @@ pub(super) struct PassedOver {
 
 /// Looks into the head of a mesh. Of a file that cannot be read nothing is said: reading its triangles says what is wrong.
 pub(super) fn passed_over(path: &Path, format: MeshFormat) -> PassedOver {
-    let only_if =
-        |(has, bytes_read): (bool, u64), text| PassedOver { colors: has.then_some(text), libraries: false, bytes_read };
+    let only_if = |(has, bytes_read): (bool, u64), text| PassedOver {
+        looks: has.then_some(text).into_iter().collect(),
+        libraries: false,
+        bytes_read,
+    };
     let found = match format {
         MeshFormat::Obj => obj::head(path).map(|head| PassedOver {
-            colors: head.passed_over(),
+            looks: head.passed_over().into_iter().collect(),
             libraries: !head.libraries.is_empty(),
             bytes_read: head.bytes_read,
         }),
-        MeshFormat::Ply => ply::colors(path).map(|(colors, bytes)| {
-            only_if(
-                (colors.is_some(), bytes),
-                "colours of the ply are passed over: name them by a mesh_attribute in a bsdf",
-            )
+        MeshFormat::Ply => ply::looks(path).map(|found| {
+            let colors = "colours of the ply are passed over: name them by a mesh_attribute in a bsdf";
+            let texture = "the texture that the ply names is passed over: put a bsdf that has it into the shape";
+            let looks = [found.colors.map(|_| colors), found.texture.map(|_| texture)].into_iter().flatten().collect();
+            PassedOver { looks, libraries: false, bytes_read: found.bytes_read }
         }),
         MeshFormat::Stl => StlReader::has_colors(path)
             .map(|found| only_if(found, "colours of the stl are passed over: a ply with colours is read with them")),

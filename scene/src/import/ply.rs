@@ -9,7 +9,7 @@ mod header;
 use std::path::Path;
 
 use self::attribute::Fields;
-pub(super) use self::attribute::colors;
+pub(super) use self::attribute::looks;
 use self::header::{Element, Format, Header, Kind, Property};
 use super::mesh::{Corners, Positions, TriangleReader, budget};
 use super::number::number;
@@ -64,19 +64,22 @@ impl PlyReader {
                 }
                 "face" => {
                     let Some(((positions, normals, uv, attribute), budget)) = vertices else {
-                        return source.fail_line("the faces stand before the vertices: write element vertex first");
+                        let message = "the faces stand before the vertices: write element vertex first";
+                        return element.fail(&source, message);
                     };
                     let list = element.properties.iter().position(|p| match p {
                         Property::List { name, .. } => name == "vertex_indices" || name == "vertex_index",
                         Property::Scalar { .. } => false,
                     });
                     let Some(list) = list else {
-                        return source.fail_line("element face has no list property vertex_indices");
+                        let message =
+                            "element face has no list property vertex_indices: name the list of a face's vertices so";
+                        return element.fail(&source, message);
                     };
                     if let Property::List { kind, .. } = element.properties[list]
                         && kind.is_float()
                     {
-                        return source.fail_line("vertex_indices are floating point numbers: use int or uint");
+                        return element.fail(&source, "vertex_indices are floating point numbers: use int or uint");
                     }
                     let of_faces = match wanted.filter(|a| a.of_faces) {
                         Some(wanted) => Some(Fields::of(wanted, &element, &source)?),
@@ -107,7 +110,7 @@ impl PlyReader {
                 }
             }
         }
-        source.fail_line("no element face: a point cloud or strips cannot be rendered, write triangles or polygons")
+        source.fail_in(1, 0, "no element face: a point cloud or strips cannot be rendered, write triangles or polygons")
     }
 
     /// PLY has no wider whole numbers than 32 bits.
@@ -115,7 +118,12 @@ impl PlyReader {
         let value = integer(&mut self.source, self.format, kind)?;
         match u32::try_from(value) {
             Ok(i) if (i as usize) < self.positions.len() => Ok(i),
-            _ => self.fail(format!("vertex index {value}, but the file has {} vertices", self.positions.len())),
+            _ => {
+                let count = self.positions.len();
+                self.fail(format!(
+                    "vertex index {value}, but the file has {count} vertices, numbered from 0: export the file again"
+                ))
+            }
         }
     }
 
@@ -123,7 +131,7 @@ impl PlyReader {
         let face = self.faces.count - self.left - 1;
         let message = format!("face {face}: {message}");
         match self.format {
-            Format::Ascii => self.source.fail_line(message),
+            Format::Ascii => self.source.fail_word(message),
             _ => self.source.fail_byte(message),
         }
     }
@@ -140,9 +148,11 @@ impl PlyReader {
                 }
             }
             let n = integer(&mut self.source, self.format, count)?;
-            let Ok(n) = u64::try_from(n) else { return self.fail(format!("{n} corners")) };
+            let Ok(n) = u64::try_from(n) else { return self.fail(format!("{n} corners: export the file again")) };
             if n > self.source.most_left() {
-                return self.fail(format!("{n} corners, which is more than the rest of the file holds"));
+                return self.fail(format!(
+                    "{n} corners, which is more than the rest of the file holds: it is truncated, get it again"
+                ));
             }
             self.read_whole(n, kind)?;
             if n >= 3 {
@@ -288,7 +298,7 @@ fn read_vertices(
     let slots: Vec<Option<usize>> = element.properties.iter().enumerate().map(slot_of).collect();
     let has = |wanted: std::ops::Range<usize>| wanted.clone().all(|s| slots.contains(&Some(s)));
     if !has(0..3) {
-        return source.fail_line("element vertex lacks one of the properties x, y and z");
+        return element.fail(source, "element vertex lacks one of the properties x, y and z: a mesh needs all three");
     }
     let double = element.properties.iter().zip(&slots).any(|(property, slot)| match property {
         Property::Scalar { kind, .. } => slot.is_some_and(|s| s < 3) && !kind.fits_f32(),
@@ -379,7 +389,7 @@ fn integer(source: &mut Source, format: Format, kind: Kind) -> Result<i64, Impor
 }
 
 fn truncated<T>(source: &Source) -> Result<T, ImportError> {
-    source.fail_line("the file ends in the middle of its data: it is truncated, get it again")
+    source.fail_word("the file ends in the middle of its data: it is truncated, get it again")
 }
 
 /// Passes a property that nobody asked for.
@@ -388,7 +398,8 @@ fn skip(source: &mut Source, format: Format, property: &Property) -> Result<(), 
         Property::Scalar { kind, .. } => skip_values(source, format, *kind, 1),
         Property::List { count, kind, .. } => match u64::try_from(integer(source, format, *count)?) {
             Ok(n) => skip_values(source, format, *kind, n),
-            Err(_) => source.fail_byte("a list of negative length"),
+            Err(_) if format == Format::Ascii => source.fail_word("a list of negative length: export the file again"),
+            Err(_) => source.fail_byte("a list of negative length: export the file again"),
         },
     }
 }

@@ -147,20 +147,19 @@ impl Source {
         (&self.path, self.line)
     }
 
-    /// An error at the last line read.
-    pub fn fail_line<T>(&self, message: impl Into<String>) -> Result<T, ImportError> {
-        let place = Place::line(&self.path, self.line.max(1));
-        Err(ImportError::Malformed { place, message: message.into() })
-    }
-
-    /// An error at the last word read.
+    /// An error at the last word read, or where the file ends if none is left.
     pub fn fail_word<T>(&self, message: impl Into<String>) -> Result<T, ImportError> {
         self.fail_at(self.word_start.saturating_sub(self.line_start) as usize, message)
     }
 
     /// An error so many bytes after the start of the last line read.
     pub fn fail_at<T>(&self, at: usize, message: impl Into<String>) -> Result<T, ImportError> {
-        let place = Place::line(&self.path, self.line.max(1)).at(at);
+        self.fail_in(self.line, at, message)
+    }
+
+    /// An error so many bytes after the start of a line.
+    pub fn fail_in<T>(&self, line: u32, at: usize, message: impl Into<String>) -> Result<T, ImportError> {
+        let place = Place::line(&self.path, line.max(1)).at(at);
         Err(ImportError::Malformed { place, message: message.into() })
     }
 
@@ -258,9 +257,8 @@ impl Source {
                     searched = self.end - self.start;
                     if searched == BUFFER {
                         self.line += 1;
-                        return self.fail_line(format!(
-                            "a line longer than {BUFFER} bytes: this is no text file of this format"
-                        ));
+                        let message = format!("a line longer than {BUFFER} bytes: this is no text file of this format");
+                        return self.fail_at(0, message);
                     }
                     self.fill(searched + 1)?;
                     if self.end - self.start == searched {
@@ -316,6 +314,7 @@ impl Source {
             if self.start == self.end {
                 self.fill(1)?;
                 if self.start == self.end {
+                    self.word_start = self.offset;
                     return Ok(None);
                 }
             }

@@ -104,12 +104,12 @@ impl StlReader {
         loop {
             let Some(word) = self.source.token()? else {
                 if let Format::Ascii { recognized: false, .. } = self.format {
-                    return self.source.fail_line("no facet in this file: it is no STL file, or it is empty");
+                    return self.source.fail_in(1, 0, "no facet in this file: it is no STL file, or it is empty");
                 }
                 if count > 0 || fan.is_some() {
                     return self
                         .source
-                        .fail_line("the file ends in the middle of a facet: it is truncated, get it again");
+                        .fail_word("the file ends in the middle of a facet: it is truncated, get it again");
                 }
                 return Ok(None);
             };
@@ -130,7 +130,8 @@ impl StlReader {
                 }
                 b"endloop" => {
                     if count > 0 {
-                        return self.source.fail_line(format!("a loop of {count} vertices"));
+                        let message = format!("a loop of {count} vertices, which has no area: export the file again");
+                        return self.source.fail_word(message);
                     }
                     fan = None;
                     self.format = Format::Ascii { fan: None, recognized: true };
@@ -155,7 +156,9 @@ impl StlReader {
                 }
                 other => {
                     let word = show(other);
-                    return self.source.fail_word(format!("\"{word}\" is no word of STL"));
+                    return self.source.fail_word(format!(
+                        "\"{word}\" is no word of STL: export the file again, in binary if you can"
+                    ));
                 }
             }
         }
@@ -170,7 +173,7 @@ impl StlReader {
                     self.source.fail_word(format!("\"{word}\" where a number should be"))
                 }
             },
-            None => self.source.fail_line("the file ends in the middle of a facet: it is truncated, get it again"),
+            None => self.source.fail_word("the file ends in the middle of a facet: it is truncated, get it again"),
         }
     }
 }

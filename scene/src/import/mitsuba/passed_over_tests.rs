@@ -179,14 +179,19 @@ fn materials_and_colours_of_meshes_have_notes() {
     let colors = "property float r\nproperty float g\nproperty float b\n";
     let faces = "element face 1\nproperty list uchar int vertex_indices\nend_header\n";
     write(&dir, "c.ply", format!("{header}{colors}{faces}0 0 0 1 1 1\n1 0 0 1 1 1\n0 1 0 1 1 1\n3 0 1 2\n"));
+    let text = format!("{header}{faces}0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n");
+    write(&dir, "t.ply", text.replace("element v", "comment TextureFile skin.png\nelement v"));
+    write(&dir, "plain.ply", text.replace("element v", "comment TextureFile\ncomment a TextureFile b\nelement v"));
     for (file, part) in [
         ("c.stl", "colours of the stl are passed over"),
         ("lib.obj", "names materials of its own"),
         ("c.obj", "colours of the obj's vertices are passed over"),
         ("w.obj", "weights of the obj's vertices are passed over"),
         ("c.ply", "colours of the ply are passed over"),
+        ("t.ply", "the texture that the ply names is passed over"),
         ("plain.stl", ""),
         ("plain.obj", ""),
+        ("plain.ply", ""),
     ] {
         let kind = file.rsplit('.').next().unwrap();
         let read = |bsdf: &str| {
@@ -205,9 +210,11 @@ fn materials_and_colours_of_meshes_have_notes() {
         }
         assert_eq!(read("<bsdf type='diffuse'/>"), "", "{file} with a material of its own");
         // of a bare mesh colours are all the same, but a PLY's, which are read
-        if kind != "ply" && file != "lib.obj" {
+        if file != "c.ply" && file != "lib.obj" {
             let notes = import(&dir.path().join(file), &ImportOptions::default()).unwrap().notes;
             assert_eq!(notes.iter().any(|n| n.text.contains(part)), !part.is_empty(), "{file}: {notes:?}");
+            let place = notes.first().map_or_else(String::new, |n| n.place.to_string());
+            assert!(file != "t.ply" || place.ends_with("t.ply:3:9"), "{place}");
         }
     }
 }

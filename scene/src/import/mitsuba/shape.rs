@@ -102,8 +102,8 @@ impl Converter<'_> {
             if head.libraries && bsdfs.is_empty() {
                 self.note(place, "this obj names materials of its own (mtllib), which are not read in an XML scene: it is grey; put a bsdf into the shape");
             }
-            if let Some(text) = head.colors.filter(|_| bsdfs.is_empty()) {
-                self.note(place, text);
+            if bsdfs.is_empty() {
+                head.looks.iter().for_each(|text| self.note(place, *text));
             }
         }
         self.ignore(id, &["silhouette_sampling_weight"]);

@@ -57,9 +57,9 @@ impl Libraries<'_> {
         let mut parts = Parts { lenient: self.options.substitute, ..Parts::default() };
         let mut made: Vec<Part> = vec![];
         let mut seen = std::collections::HashSet::new();
-        for (name, line) in names {
+        for (name, line, at) in names {
             parts.libraries.push(name.clone());
-            let place = Place::line(obj, *line);
+            let place = Place::line(obj, *line).at(*at);
             for path in self.paths(folder, name, &place)? {
                 for entry in entries(&path, &mut self.out.bytes_read)? {
                     if !seen.insert(entry.name.clone()) {

@@ -186,20 +186,20 @@ fn what_cannot_be_read_is_named() {
     let lenient = ImportOptions { substitute: true, ..ImportOptions::default() };
     let unknown = "usemtl red\nf 1 2 3\n";
     let error = import_with("newmtl m\n", unknown, &strict).unwrap_err().to_string();
-    assert!(error.contains("a.obj:8: usemtl \"red\", which no mtllib of this file defines"), "{error}");
+    assert!(error.contains("a.obj:8:8: usemtl \"red\", which no mtllib of this file defines"), "{error}");
     assert!(import_with("newmtl m\n", unknown, &lenient).is_ok());
     let late = "f 1 2 3\nmtllib b.mtl\n";
     let error = import_with("newmtl m\n", late, &strict).unwrap_err().to_string();
-    assert!(error.contains("a.obj:9: mtllib \"b.mtl\" stands after the first vertex"), "{error}");
+    assert!(error.contains("a.obj:9:8: mtllib \"b.mtl\" stands after the first vertex"), "{error}");
     // one that is found when the vertices have been read is not passed over
     let dir = folder();
     let path = write(&dir, "a.obj", format!("{TRIANGLE}mtllib b.mtl\nusemtl m\nf 1 2 3\n"));
     let error = import(&path, &strict).unwrap_err().to_string();
-    assert!(error.contains("a.obj:7: mtllib \"b.mtl\" stands after the first vertex"), "{error}");
+    assert!(error.contains("a.obj:7:8: mtllib \"b.mtl\" stands after the first vertex"), "{error}");
     let dir = folder();
     let path = write(&dir, "a.obj", format!("mtllib b.mtl c.mtl\n{TRIANGLE}f 1 2 3\n"));
     let error = import(&path, &strict).unwrap_err().to_string();
-    assert!(error.contains("a.obj:1: material library \"b.mtl\"") && error.contains("\"c.mtl\""), "{error}");
+    assert!(error.contains("a.obj:1:8: material library \"b.mtl\"") && error.contains("\"c.mtl\""), "{error}");
     assert_eq!(import(&path, &lenient).unwrap().substitutions.len(), 2);
     // names with blanks are one file if there is one
     write(&dir, "b.mtl c.mtl", "newmtl only\n");

@@ -10,7 +10,7 @@ use rayherd_render::texture::decode_srgb;
 use super::header::{Element, Format, Header, Kind, Property};
 use super::{scalar, skip};
 use crate::ImportError;
-use crate::description::MeshAttribute;
+use crate::description::{MeshAttribute, Place};
 use crate::import::source::Source;
 
 /// Where an attribute stands among an element's properties, and its value at the element that was read last.
@@ -31,16 +31,27 @@ fn spellings(name: &str) -> Vec<[String; 3]> {
     }
 }
 
-/// The colours that a file's vertices have, else those of its faces; `None` if neither has any. And the bytes read of it.
-pub(in crate::import) fn colors(path: &Path) -> Result<(Option<MeshAttribute>, u64), ImportError> {
+/// How a file's surface looks, as far as its header says.
+pub(in crate::import) struct Looks {
+    /// Colours of its vertices, else of its faces.
+    pub colors: Option<MeshAttribute>,
+    /// Where it names a texture.
+    pub texture: Option<Place>,
+    /// Bytes read to know.
+    pub bytes_read: u64,
+}
+
+/// Reads a header for what it says of looks.
+pub(in crate::import) fn looks(path: &Path) -> Result<Looks, ImportError> {
     let mut source = Source::open_head(path)?;
     let header = Header::read(&mut source)?;
-    let found = [("vertex", false), ("face", true)].into_iter().find_map(|(name, of_faces)| {
+    let colors = [("vertex", false), ("face", true)].into_iter().find_map(|(name, of_faces)| {
         let wanted = MeshAttribute { of_faces, name: "color".into(), srgb: true };
         let element = header.elements.iter().find(|e| e.name == name)?;
         (places(&wanted, element)?.len() == 3).then_some(wanted)
     });
-    Ok((found, source.bytes_read()))
+    let texture = header.texture.map(|(line, at)| Place::line(path, line).at(at));
+    Ok(Looks { colors, texture, bytes_read: source.bytes_read() })
 }
 
 /// Numbers of an attribute's properties: three, or the first; `None` if that is not there.
@@ -59,12 +70,13 @@ impl Fields {
     pub(super) fn of(wanted: &MeshAttribute, element: &Element, source: &Source) -> Result<Fields, ImportError> {
         let Some(places) = places(wanted, element) else {
             let names: Vec<String> = spellings(&wanted.name).iter().map(|names| names.join(" ")).collect();
-            return source.fail_line(format!(
-                "element {} has no properties {}, which the mesh attribute \"{}\" is read from",
+            let message = format!(
+                "element {} has no properties {}, which the mesh attribute \"{}\" is read from: add them, or name another",
                 element.name,
                 names.join(" or "),
                 wanted.name
-            ));
+            );
+            return element.fail(source, message);
         };
         let largest = |i: usize| match &element.properties[i] {
             Property::Scalar { kind: Kind::U8, .. } if wanted.srgb => Some(255.0),

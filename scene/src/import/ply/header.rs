@@ -1,7 +1,7 @@
 //! The header of a PLY file, and its types.
 
 use crate::ImportError;
-use crate::import::source::{Source, show};
+use crate::import::source::{Source, Words, show};
 
 /// Longest header.
 const MAX_BYTES: u64 = 1 << 20;
@@ -43,6 +43,16 @@ pub struct Element {
     pub name: String,
     pub count: u64,
     pub properties: Vec<Property>,
+    /// Line of the header that names it, and bytes before it there.
+    line: u32,
+    at: usize,
+}
+
+impl Element {
+    /// An error where the header names it.
+    pub fn fail<T>(&self, source: &Source, message: impl Into<String>) -> Result<T, ImportError> {
+        source.fail_in(self.line, self.at, message)
+    }
 }
 
 /// What a file says of itself.
@@ -50,6 +60,8 @@ pub struct Element {
 pub struct Header {
     pub format: Format,
     pub elements: Vec<Element>,
+    /// Line of the comment that names a texture, as MeshLab writes it, and bytes before it there.
+    pub texture: Option<(u32, usize)>,
 }
 
 impl Kind {
@@ -115,37 +127,54 @@ impl Header {
     pub fn read(source: &mut Source) -> Result<Header, ImportError> {
         let mut format = None;
         let mut elements: Vec<Element> = vec![];
+        let mut texture = None;
         if source.peek(3)? != b"ply" || source.line_bytes()?.is_none_or(|line| line.trim_ascii_end() != b"ply") {
-            return source.fail_line("this is no PLY file: its first line is not \"ply\"");
+            return source.fail_at(0, "this is no PLY file: its first line is not \"ply\"");
         }
         loop {
             if source.offset() > MAX_BYTES {
-                return source.fail_line(format!("the header is longer than {MAX_BYTES} bytes"));
+                let message = format!("the header is longer than {MAX_BYTES} bytes: take comments out of it");
+                return source.fail_at(0, message);
             }
             let Some(line) = source.line_bytes()? else {
-                return source.fail_line("the file ends in its header: no line end_header");
+                return source.fail_at(0, "the file ends in its header: no line end_header, get it again");
             };
             let text = show_all(line);
-            let words: Vec<&str> = text.split_ascii_whitespace().collect();
+            let (mut words, mut places) = (vec![], vec![]);
+            let mut split = Words::new(text.as_bytes());
+            while let Some(word) = split.next() {
+                words.push(&text[split.at()..split.at() + word.len()]);
+                places.push(split.at());
+            }
+            let place = |word: usize| places.get(word).copied().unwrap_or(0);
             match words[..] {
                 ["end_header"] => break,
+                ["comment", "TextureFile", _, ..] if texture.is_none() => texture = Some((source.place().1, place(1))),
                 [] | ["comment" | "obj_info", ..] => {}
                 ["format", name, _version] => {
                     format = match name {
                         "ascii" => Some(Format::Ascii),
                         "binary_little_endian" => Some(Format::LittleEndian),
                         "binary_big_endian" => Some(Format::BigEndian),
-                        _ => return source.fail_line(format!("unknown format \"{name}\"")),
+                        _ => {
+                            let message = format!(
+                                "unknown format \"{name}\": it should be ascii, binary_little_endian or binary_big_endian"
+                            );
+                            return source.fail_at(place(1), message);
+                        }
                     }
                 }
                 ["element", name, count] => {
                     let Ok(count) = count.parse() else {
-                        return source.fail_line(format!("\"{count}\" is no number of elements"));
+                        let message = format!("\"{count}\" is no number of elements: export the file again");
+                        return source.fail_at(place(2), message);
                     };
                     if elements.len() == MAX_ELEMENTS {
-                        return source.fail_line(format!("more than {MAX_ELEMENTS} elements"));
+                        let message = format!("more than {MAX_ELEMENTS} elements: leave out what is no mesh");
+                        return source.fail_at(place(0), message);
                     }
-                    elements.push(Element { name: name.into(), count, properties: vec![] });
+                    let (line, at) = (source.place().1, place(1));
+                    elements.push(Element { name: name.into(), count, properties: vec![], line, at });
                 }
                 ["property", ref rest @ ..] => {
                     let property = match *rest {
@@ -157,23 +186,41 @@ impl Header {
                         _ => None,
                     };
                     let Some(property) = property else {
-                        return source.fail_line(format!("no property that PLY knows: {}", show(text.as_bytes())));
+                        let message = format!(
+                            "no property that PLY knows: {}; it should be TYPE NAME, or list TYPE TYPE NAME with whole numbers for its length",
+                            show(text.as_bytes())
+                        );
+                        return source.fail_at(place(0), message);
                     };
                     match elements.last_mut() {
                         Some(element) if element.properties.len() < MAX_PROPERTIES => element.properties.push(property),
-                        Some(_) => return source.fail_line(format!("more than {MAX_PROPERTIES} properties")),
-                        None => return source.fail_line("a property before the first element"),
+                        Some(_) => {
+                            let message = format!("more than {MAX_PROPERTIES} properties: leave out some");
+                            return source.fail_at(place(0), message);
+                        }
+                        None => {
+                            let message = "a property before the first element: put it below the element that has it";
+                            return source.fail_at(place(0), message);
+                        }
                     }
                 }
-                _ => return source.fail_line(format!("no header line that PLY knows: {}", show(text.as_bytes()))),
+                _ => {
+                    let message = format!(
+                        "no header line that PLY knows: {}; a header ends with end_header",
+                        show(text.as_bytes())
+                    );
+                    return source.fail_at(place(0), message);
+                }
             }
         }
         match format {
             Some(format) => {
                 source.begin_tokens();
-                Ok(Header { format, elements })
+                Ok(Header { format, elements, texture })
             }
-            None => source.fail_line("the header has no line format"),
+            None => {
+                source.fail_at(0, "the header has no line format: write \"format ascii 1.0\", or that of its numbers")
+            }
         }
     }
 

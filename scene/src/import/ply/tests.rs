@@ -148,25 +148,31 @@ fn errors_name_the_place() {
     let small = "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n\
                  element face 1\nproperty list uchar int vertex_indices\nend_header\n0 0 0\n1 0 0\n0 2 0\n3 0 1 2\n";
     let cases: &[(&str, &str, &str)] = &[
-        ("3 0 1 2", "3 0 1 3", "a.ply:13: face 0: vertex index 3, but the file has 3 vertices"),
-        ("3 0 1 2", "3 0 1 -1", "vertex index -1"),
-        ("3 0 1 2", "3 0 1", "truncated"),
-        ("3 0 1 2", "250 0 1 2", "more than the rest"),
-        ("3 0 1 2", "-3 0 1 2", "-3 corners"),
+        (
+            "3 0 1 2",
+            "3 0 1 3",
+            "a.ply:13:7: face 0: vertex index 3, but the file has 3 vertices, numbered from 0: export the file again",
+        ),
+        ("3 0 1 2", "3 0  -1 2", "a.ply:13:6: face 0: vertex index -1"),
+        ("3 0 1 2", "3 0 1", "a.ply:14:1: the file ends in the middle of its data: it is truncated, get it again"),
+        ("3 0 1 2", "250 0 1 2", "a.ply:13:1: face 0: 250 corners, which is more than the rest of the file holds"),
+        ("3 0 1 2", "-3 0 1 2", "a.ply:13:1: face 0: -3 corners: export the file again"),
         ("3 0 1 2", "3 0 x 2", "a.ply:13:5: \"x\" where a whole number"),
         ("1 0 0\n", "1 zero 0\n", "a.ply:11:3: \"zero\" where a number"),
         ("vertex 3", "vertex 4000000000", "truncated"),
         ("face 1", "face 18446744073709551615", "truncated"),
-        ("face 1", "face -1", "a.ply:7: \"-1\" is no number of elements"),
-        ("format ascii 1.0\n", "", "no line format"),
-        ("ascii", "ebcdic", "a.ply:2: unknown format"),
-        ("property float x\n", "", "lacks one of the properties"),
-        ("list uchar int", "list float int", "no property that PLY knows"),
-        ("list uchar int", "list uchar float", "floating point"),
-        ("vertex_indices", "corners", "no list property"),
-        ("element face 1\nproperty list uchar int vertex_indices\n", "", "no element face"),
-        ("end_header\n", "", "no header line that PLY knows"),
-        ("ply\n", "plywood\n", "no PLY file"),
+        ("face 1", "face -1", "a.ply:7:14: \"-1\" is no number of elements: export"),
+        ("format ascii 1.0\n", "", "a.ply:8:1: the header has no line format: write"),
+        ("ascii", "ebcdic", "a.ply:2:8: unknown format \"ebcdic\": it should be ascii, binary"),
+        ("property float x\n", "", "a.ply:3:9: element vertex lacks one of the properties"),
+        ("list uchar int", "list float int", "a.ply:8:1: no property that PLY knows"),
+        ("list uchar int", "list uchar float", "a.ply:7:9: vertex_indices are floating point numbers: use int"),
+        ("vertex_indices", "corners", "a.ply:7:9: element face has no list property"),
+        ("element face 1\nproperty list uchar int vertex_indices\n", "", "a.ply:1:1: no element face"),
+        ("element vertex 3\n", "", "a.ply:3:1: a property before the first element: put it below"),
+        ("end_header\n", "", "a.ply:9:1: no header line that PLY knows: 0 0 0; a header ends with end_header"),
+        ("end_header\n0 0 0\n1 0 0\n0 2 0\n3 0 1 2\n", "", "a.ply:8:1: the file ends in its header"),
+        ("ply\n", "plywood\n", "a.ply:1:1: this is no PLY file"),
     ];
     for (from, to, what) in cases {
         let text = small.replacen(from, to, 1);
@@ -240,9 +246,9 @@ fn colours_of_vertices_and_faces() {
     assert_eq!(attributes(&text, "heat", false, false).unwrap(), [[[1.0, 2.0, 3.0]; 3]; 2]);
     assert_eq!(attributes(&text, "color_tone", false, false).unwrap()[1], [[4.0; 3]; 3]);
     let error = attributes(&text, "color", false, false).unwrap_err().to_string();
-    assert!(error.contains("a.ply:") && error.contains("r g b or red green blue"), "{error}");
+    assert!(error.contains("a.ply:3:9: ") && error.contains("r g b or red green blue"), "{error}");
     let error = attributes(&text, "heat", true, false).unwrap_err().to_string();
-    assert!(error.contains("element face has no properties heat_x heat_y heat_z"), "{error}");
+    assert!(error.contains("a.ply:11:9: element face has no properties heat_x heat_y heat_z"), "{error}");
     let cut = &text[..text.len() - 12];
     assert!(attributes(cut, "heat", false, false).unwrap_err().to_string().contains("truncated"));
 }

@@ -43,12 +43,13 @@ fn errors_name_the_place() {
         (binary(1, &one)[..100].to_vec(), "hold 0"),
         (vec![0; 10], "too short"),
         (vec![], "too short"),
-        (ASCII.into(), "a.stl:11:1: \"FACET\" is no word"),
-        (b"solid x\n".to_vec(), "no facet"),
-        (b"solid x\nfacet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0".to_vec(), "truncated"),
+        (ASCII.into(), "a.stl:11:1: \"FACET\" is no word of STL: export"),
+        (b"solid x\n".to_vec(), "a.stl:1:1: no facet"),
+        (b"solid x\nfacet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0".to_vec(), "a.stl:5:11: the file ends in"),
+        (b"solid x\nfacet normal 0 0 1\nouter loop\nvertex 0 0 0\n\n".to_vec(), "a.stl:6:1: the file ends in"),
         (
-            b"solid x\nfacet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nendloop".to_vec(),
-            "a.stl:6: a loop of 2",
+            b"solid x\nfacet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0 0\n endloop".to_vec(),
+            "a.stl:6:2: a loop of 2 vertices, which has no area: export the file again",
         ),
         (b"solid x\nfacet normal 0 0 up\n".to_vec(), "a.stl:2:18: \"up\" where a number"),
     ];
