@@ -133,9 +133,9 @@ fn what_is_missing_empty_cut_or_noise() {
         .write("cut.ply.gz", b"\x1f\x8b\x08\0\0\0\0\0\0\x03");
     bed.mistakes(&[
         ("render cut.stl", &["cut.stl", "2 triangles", "truncated"]),
-        ("render cut-text.stl", &["cut-text.stl:6", "truncated"]),
+        ("render cut-text.stl", &["cut-text.stl:6:1: ", "truncated"]),
         ("render cut.xml", &["cut.xml:1", "not well-formed", "never closed"]),
-        ("render cut.obj", &["cut.obj:2", "needs 3"]),
+        ("render cut.obj", &["cut.obj:2:5: v needs 3", "export the file again"]),
         ("render cut.nrrd --iso 5", &["cut.nrrd", "holds 69 bytes", "truncated"]),
         ("render cut.ply.gz", &["cut.ply.gz", "get the file again"]),
         ("render .", &["."]),
@@ -333,12 +333,12 @@ fn cycles_and_references_to_nothing() {
         ("render group.xml", &["group.xml:3", "cycle through \"g\""]),
         ("render nothing.xml", &["nothing.xml:3", "ref to \"no\"", "nothing in the scene has this id"]),
         ("render twice.xml", &["twice.xml:3", "id \"m\" is taken", "its own"]),
-        ("render beyond.obj", &["beyond.obj:5", "index 4 of v, but 3"]),
-        ("render zero.obj", &["zero.obj:4", "index 0"]),
-        ("render back.obj", &["back.obj:4", "index -4"]),
-        ("render huge.obj", &["huge.obj:4"]),
-        ("render beyond.ply", &["beyond.ply:13", "vertex index 3, but the file has 3"]),
-        ("render minus.ply", &["minus.ply:13", "vertex index -1"]),
+        ("render beyond.obj", &["beyond.obj:5:7: index 4 of v, but 3", "a face names what stands before it"]),
+        ("render zero.obj", &["zero.obj:4:3: index 0"]),
+        ("render back.obj", &["back.obj:4:9: index -4"]),
+        ("render huge.obj", &["huge.obj:4:7: "]),
+        ("render beyond.ply", &["beyond.ply:13:7: ", "vertex index 3, but the file has 3", "export the file again"]),
+        ("render minus.ply", &["minus.ply:13:7: ", "vertex index -1"]),
     ]);
 }
 
@@ -377,6 +377,9 @@ fn nothing_to_see_or_to_see_by() {
         .write("t.obj", TRIANGLE)
         .xml("rough.xml", &rough("-1"))
         .xml("rough-nan.xml", &rough("NaN").replace("NaN", "nan"))
+        .xml("ior.xml", &format!("<shape type='cube'><bsdf type='dielectric'>\n <float name='int_ior' value='0'/></bsdf></shape>{LIT}"))
+        .xml("albedo.xml", &format!("<shape type='cube'><bsdf type='diffuse'>\n <rgb name='reflectance' value='2'/></bsdf></shape>{LIT}"))
+        .xml("factor.xml", &format!("<shape type='cube'><bsdf type='plastic'>\n\n  <rgb name='specular_reflectance' value='1, 1, -1'/></bsdf></shape>{LIT}"))
         .xml("line-light.xml", {
             "<shape type='cube'/><shape type='rectangle' id='lamp'>\n<transform name='to_world'><scale x='0'/></transform>\
              <emitter type='area'/></shape>"
@@ -402,7 +405,12 @@ fn nothing_to_see_or_to_see_by() {
         ("render film-large.xml", &["film-large.xml:2", "width 100000 should lie between 1 and 65535"]),
         ("render t.obj --size 0x0", &["0x0", "--size"]),
         ("render t.obj --size 100000x100000", &["100000x100000", "--size"]),
-        ("render rough.xml", &["rough.xml:2", "roughness [-1.0, -1.0] should lie in (0, 1]"]),
+        ("render ior.xml", &["ior.xml:3:2: ", "int_ior over ext_ior is 0; it should lie between 0.1 and 10"]),
+        ("check ior.xml", &["ior.xml:3:2: "]),
+        ("render albedo.xml", &["albedo.xml:3:2: ", "reflectance [2.0, 2.0, 2.0] should lie in [0, 1]"]),
+        ("check albedo.xml", &["albedo.xml:3:2: "]),
+        ("render factor.xml", &["factor.xml:4:3: ", "specular_reflectance [1.0, 1.0, -1.0] should lie in [0, 1]"]),
+        ("render rough.xml", &["rough.xml:2:48: roughness [-1.0, -1.0] should lie in (0, 1]"]),
         ("render rough-nan.xml", &["rough-nan.xml:2", "\"nan\" is not finite"]),
     ]);
 

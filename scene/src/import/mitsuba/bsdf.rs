@@ -291,12 +291,16 @@ impl Converter<'_> {
         self.albedo(id, name)
     }
 
+    /// Where a property stands, or the object where it has none of the name.
+    pub(super) fn place_of(&self, id: ObjectId, name: &str) -> &Place {
+        self.property(id, name).map_or(&self.document.objects[id].place, |p| &p.place)
+    }
+
     /// A colour in [0, 1].
     pub(super) fn albedo(&mut self, id: ObjectId, name: &str) -> Result<Option<[f32; 3]>, ImportError> {
         let Some(rgb) = self.color(id, name, DEFAULT_REFLECTANCE.into())? else { return Ok(None) };
         if rgb.iter().any(|v| !(0.0..=1.0).contains(v)) {
-            let place = &self.document.objects[id].place;
-            return malformed(place, format!("{name} {rgb:?} should lie in [0, 1]"));
+            return malformed(self.place_of(id, name), format!("{name} {rgb:?} should lie in [0, 1]"));
         }
         Ok(Some(rgb.map(|v| v as f32)))
     }
@@ -377,8 +381,12 @@ impl Converter<'_> {
             (None, Some(u), Some(v)) => [u, v],
             _ => return malformed(place, "give alpha, or both alpha_u and alpha_v"),
         };
-        if alpha.iter().any(|a| !(*a > 0.0 && *a <= 1.0)) {
-            return malformed(place, format!("roughness {alpha:?} should lie in (0, 1]; use conductor for a mirror"));
+        if let Some(wrong) = alpha.iter().position(|a| !(*a > 0.0 && *a <= 1.0)) {
+            let name = if given.1.is_none() { "alpha" } else { ["alpha_u", "alpha_v"][wrong] };
+            return malformed(
+                self.place_of(id, name),
+                format!("roughness {alpha:?} should lie in (0, 1]; use conductor for a mirror"),
+            );
         }
         Ok(alpha.map(|a| a as f32))
     }

@@ -87,8 +87,10 @@ impl Converter<'_> {
         let outside = self.index(id, "ext_ior", "air")?;
         let eta = inside / outside;
         if !(1.0 / LARGEST..=LARGEST).contains(&eta) {
-            let place = &self.document.objects[id].place;
-            return malformed(place, format!("int_ior over ext_ior is {eta}; it should lie between 0.1 and 10"));
+            return malformed(
+                self.place_of(id, "int_ior"),
+                format!("int_ior over ext_ior is {eta}; it should lie between 0.1 and 10"),
+            );
         }
         Ok(eta as f32)
     }
