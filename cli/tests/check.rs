@@ -29,7 +29,7 @@ fn materials_of_a_mesh_are_told() {
     let check = |arguments: &[&str]| rayherd(folder.path(), &[&["check"], arguments].concat());
     let run = check(&["a.obj"]);
     assert!(
-        run.code == 2 && run.err.contains("a.obj:2: material library \"a.mtl\" (there is no such file)"),
+        run.code == 2 && run.err.contains("a.obj:2:8: material library \"a.mtl\" (there is no such file)"),
         "{}",
         run.err
     );
@@ -55,6 +55,53 @@ fn materials_of_a_mesh_are_told() {
     assert!(run.err.contains("s.xml:2:1: sensor \"two\" is left out"), "{}", run.err);
 }
 
+/// Bytes that are told.
+fn bytes(text: &str) -> f64 {
+    let (number, unit) = text.split_once(' ').unwrap_or_else(|| panic!("{text:?}"));
+    let power = ["B", "KiB", "MiB", "GiB"].iter().position(|u| *u == unit).unwrap_or_else(|| panic!("{text:?}"));
+    number.parse::<f64>().unwrap() * 1024f64.powi(power as i32)
+}
+
+/// What a node is said to need is what a render asks for whose memory does not suffice, and what the prepared scene is said to take is about what the store
+/// then holds of it. This mesh takes more than most: its triangles lie in rows of the same height.
+#[test]
+fn memory_that_is_needed_is_told() {
+    let folder = tempfile::tempdir().unwrap();
+    let run = |line: &str| rayherd(folder.path(), &line.split(' ').collect::<Vec<_>>());
+    let tetrahedron = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 3 1 4\n";
+    fs::write(folder.path().join("t.obj"), tetrahedron).unwrap();
+    assert_eq!(run("scene subdivide t.obj -o s.ply --levels 7").code, 0);
+    let told = run("check s.ply").out;
+    let line = told.lines().find(|l| l.starts_with("prepared")).unwrap_or_else(|| panic!("{told}"));
+    let (all, one) = line.split_once("; a node needs memory for one split at least, ").unwrap();
+    let all = bytes(all.split_once("about ").unwrap().1);
+    let (one, block) = one.split_once(" (with a --block-size of ").unwrap();
+    assert_eq!(block, "128.0 MiB)");
+    let (least, most) = one.split_once(" to ").unwrap();
+    let [least, most] = [least, most].map(bytes);
+
+    let refused = run("render s.ply --size 8x8 --spp 1 --memory 100").err;
+    let needed = refused.split("the largest split takes ").nth(1).and_then(|t| t.split(';').next());
+    let needed: f64 = needed.unwrap_or_else(|| panic!("{refused}")).parse().unwrap();
+    assert!(least <= needed && needed <= most && most < 2.0 * least, "{line}: {needed}");
+
+    assert_eq!(run("prepare s.ply --store p").code, 0);
+    let mut found = 0;
+    let mut folders = vec![folder.path().join("p")];
+    while let Some(next) = folders.pop() {
+        for entry in fs::read_dir(next).unwrap().map(Result::unwrap) {
+            if entry.file_type().unwrap().is_dir() {
+                folders.push(entry.path());
+            } else {
+                found += entry.metadata().unwrap().len();
+            }
+        }
+    }
+    assert!(all < 1.1 * found as f64 && all > 0.6 * found as f64, "{line}: {found}");
+    // 65,536 triangles and two lamps
+    assert!(all > 65_540.0 * 50.0, "{line}");
+}
+
 /// Everything wrong is told at once: what is not supported, and each file that is broken.
 #[test]
 fn all_problems_are_named() {
@@ -73,7 +120,7 @@ fn all_problems_are_named() {
     assert_eq!(run.code, 2, "{}", run.err);
     for part in [
         "s.xml:7:26: mesh file \"gone.serialized\" (there is no such file)",
-        "cut.ply",
+        "cut.ply:4:1: the file ends in its header: no line end_header, get it again",
         "s.xml:4:25: bsdf \"ward\" is not supported",
         "error: 3 problems in s.xml",
     ] {
@@ -85,7 +132,7 @@ fn all_problems_are_named() {
     // a stand-in that was asked for is no problem
     let run = rayherd(folder.path(), &["check", "s.xml", "--substitute"]);
     assert!(run.code == 2 && run.err.contains("error: 1 problem in s.xml"), "{}", run.err);
-    // a file that is not there ends the reading of the XML
+    // of a file that is not there the XML's place is told
     fs::write(folder.path().join("t.xml"), text.replace("cut.ply", "gone.ply")).unwrap();
     let run = rayherd(folder.path(), &["check", "t.xml"]);
     assert!(run.code == 2 && run.err.contains("t.xml:3") && run.err.contains("gone.ply"), "{}", run.err);

@@ -12,6 +12,7 @@ use rayherd_scene::description::{
     Amount, Beam, Bsdf, Description, Environment, Geometry, Material, MeshFormat, Projection, TextureKind,
 };
 use rayherd_scene::import::{ImportOptions, Survey, import, sky_map};
+use rayherd_scene::prepare::{Cut, PrepareSettings};
 
 use super::{print, size};
 use crate::options::{self, SceneOptions};
@@ -113,10 +114,11 @@ fn tell(scene: &str, description: &Description, survey: &Survey) -> String {
         line("colours", format!("{} with a mesh attribute", count(with_attribute, "triangle")));
     }
     let total = survey.prepared_bytes();
-    line(
-        "prepared",
-        format!("about {}; a node needs memory for one split (--block-size, 128 MiB) at least", size(total)),
-    );
+    let Cut::BlockSize(block) = PrepareSettings::default().cut else { unreachable!("the default is a size") };
+    let [least, most] = survey.split_bytes(block).map(size);
+    let one = if least == most { least } else { format!("{least} to {most}") };
+    let needed = format!("a node needs memory for one split at least, {one} (with a --block-size of {})", size(block));
+    line("prepared", format!("about {}; {needed}", size(total)));
     out
 }
 

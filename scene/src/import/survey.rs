@@ -11,6 +11,10 @@ use crate::record::{Record, SphereRecord, TriangleRecord};
 
 /// Of a geometry object a triangle takes about this (eight-wide nodes, vertices, ids; measured 51.8 on 8 million triangles).
 const BYTES_PER_TRIANGLE: u64 = 52;
+/// And at most: where primitives of all sizes cross each other, or lie in rows that trees halve badly, leaves hold fewer ([`crate::split`]).
+const MOST_PER_TRIANGLE: u64 = 90;
+/// Likewise a sphere.
+const BYTES_PER_SPHERE: u64 = 28;
 
 /// What was found in a description's shapes.
 #[derive(Debug)]
@@ -90,9 +94,29 @@ impl Survey {
     pub fn prepared_bytes(&self) -> u64 {
         let shapes = self.sum(|s| {
             let attributes = (s.with_normals + s.with_attribute) * 36 + s.with_uv * 24;
-            s.triangles * (BYTES_PER_TRIANGLE + 4) + attributes + s.spheres * 32
+            s.triangles * (BYTES_PER_TRIANGLE + 4) + attributes + s.spheres * (BYTES_PER_SPHERE + 4)
         });
         shapes + self.texture_bytes()
+    }
+
+    /// What the largest split takes in a node's memory, bytes, least and most, where blocks take so many: all but the texels where one block holds all, else
+    /// a block and what its primitives have beside it.
+    pub fn split_bytes(&self, block: u64) -> [u64; 2] {
+        let beside = self.prepared_bytes() - self.texture_bytes() - self.block_bytes(BYTES_PER_TRIANGLE);
+        let mut out = [BYTES_PER_TRIANGLE, MOST_PER_TRIANGLE].map(|each| {
+            let trees = self.block_bytes(each);
+            // in u128, as both may be of any size
+            let part = u128::from(trees + beside) * u128::from(block) / u128::from(trees.max(1));
+            (trees + beside).min(u64::try_from(part).unwrap_or(u64::MAX))
+        });
+        // of several blocks those with fewer triangles have less beside them
+        out.sort_unstable();
+        out
+    }
+
+    /// Of all blocks, where a triangle takes so much.
+    fn block_bytes(&self, each: u64) -> u64 {
+        self.sum(|s| s.triangles * each + s.spheres * BYTES_PER_SPHERE)
     }
 
     /// Bytes of the texels of all textures.

@@ -157,3 +157,45 @@ fn what_cannot_be_read_says_so() {
         ImportOptions { sky: Some([0.0; 3]), lights: vec!["0,0,5,0,0,0,1,1,0".parse().unwrap()], ..Default::default() };
     assert!(import(&mesh, &options).unwrap_err().to_string().contains("emits light"));
 }
+
+/// What a survey says of memory is what preparing makes, whether one block holds all or several do.
+#[test]
+fn a_survey_knows_what_preparing_makes() {
+    use crate::objects::MemoryObjects;
+    use crate::prepare::{Cut, NoProgress, PrepareSettings, SpoolSettings, prepare};
+    let dir = folder();
+    let n = 120;
+    let mut text = String::new();
+    for i in 0..n * n {
+        text += &format!("v {} {} {}\nvt 0.{i} 0.5\n", i % n, i / n, (i * 7919 % 101) as f64 / 101.0);
+    }
+    for i in (1..n * (n - 1)).filter(|i| i % n != 0) {
+        let [a, b, c, d] = [i, i + 1, i + n + 1, i + n];
+        text += &format!("f {a}/{a} {b}/{b} {c}/{c} {d}/{d}\n");
+    }
+    let path = write(&dir, "grid.obj", text);
+    for (smooth, block) in [(false, 128 << 20), (true, 128 << 20), (true, 200_000), (false, 500_000)] {
+        let mut description = import(&path, &ImportOptions::default()).unwrap();
+        if let Geometry::MeshFile { smooth: slot, .. } = &mut description.shapes[0].geometry {
+            *slot = smooth;
+        }
+        let survey = Survey::of(&description);
+        let source = DescriptionSource::new(&description, StreamOptions::default());
+        let settings =
+            PrepareSettings { cut: Cut::BlockSize(block), overlap_reduction: false, ..PrepareSettings::default() };
+        let store = MemoryObjects::new();
+        let made = prepare(&description, &source, &settings, &SpoolSettings::default(), &store, &NoProgress).unwrap();
+        let splits: Vec<u64> = made.manifest.splits.iter().map(|s| s.geometry.bytes + s.attributes.bytes).collect();
+        let near = |told: u64, found: u64| (told as f64 / found as f64 - 1.0).abs() < 0.15;
+        let (all, largest) = (splits.iter().sum::<u64>(), *splits.iter().max().unwrap());
+        assert!((splits.len() > 1) == (block < 1 << 20), "{splits:?}");
+        assert!(near(survey.prepared_bytes(), all), "{smooth} {block}: {} {all}", survey.prepared_bytes());
+        // this mesh is a good one
+        let [least, most] = survey.split_bytes(block);
+        assert!(
+            near(if splits.len() > 1 { most } else { least }, largest),
+            "{smooth} {block}: {least} to {most}, {largest}"
+        );
+        assert!(least <= most && most < 2 * least);
+    }
+}
