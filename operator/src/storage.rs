@@ -147,8 +147,8 @@ mod tests {
     async fn a_storage_of_a_clouds_identity_needs_no_secret() {
         let (service, mut server) = tower_test::mock::pair::<Request<Body>, Response<Body>>();
         let client = Client::new(service, "default");
-        let found = Storage { identity: true, ..Storage::default() };
-        let told = credentials(&client, "studio", &StorageSpec::default(), &found);
+        let (spec, found) = (StorageSpec::default(), Storage { identity: true, ..Storage::default() });
+        let told = credentials(&client, "studio", &spec, &found);
         let told = tokio::time::timeout(Duration::from_secs(20), told).await.expect("nobody is asked");
         let own = S3Credentials::identity().map_err(|e| format!("the operator: {e}"));
         assert_eq!(told.map_err(|e| e.to_string()), own);
@@ -156,7 +156,7 @@ mod tests {
         assert!(asked.is_err(), "a request to the API server");
         // without one it is read
         let of_key = Storage::default();
-        let keys = credentials(&client, "studio", &StorageSpec::default(), &of_key);
+        let keys = credentials(&client, "studio", &spec, &of_key);
         tokio::select! {
             _ = keys => panic!("nobody has answered"),
             asked = server.next_request() => {
