@@ -211,8 +211,10 @@ fn an_operator_that_comes_after_the_cut_has_nothing_cut_again() {
                 if epoch == "e1" {
                     wait_for(|| gate.count(is_build) > 0);
                     fleet.cancel("stopped by the test");
+                    // before the gate opens, or on a busy machine all might be built until the job looks whether it is to go on
+                    let ended = job.join().unwrap();
                     gate.closed.store(false, Ordering::Relaxed);
-                    assert!(matches!(job.join().unwrap(), Err(JobError::Owned(_))));
+                    assert!(matches!(ended, Err(JobError::Owned(_))));
                 } else {
                     job.join().unwrap().unwrap();
                 }
