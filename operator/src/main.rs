@@ -21,6 +21,7 @@ mod tasks;
 mod tests;
 mod tls;
 mod trial;
+mod trigger;
 mod watching;
 
 use std::process::ExitCode;
@@ -28,10 +29,11 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use futures::StreamExt;
+use futures::channel::mpsc;
 use k8s_openapi::api::core::v1::Pod;
 use kube::api::{Patch, PatchParams};
 use kube::runtime::controller::{self, Controller};
-use kube::runtime::watcher;
+use kube::runtime::{WatchStreamExt, reflector, watcher};
 use kube::{Api, client::ClientBuilder};
 use rayherd_api::resource::definition;
 use serde_json::json;
@@ -94,7 +96,8 @@ async fn run() -> anyhow::Result<()> {
     let metrics = Metrics::new()?;
     let settings = kube::Config::infer().await?;
     let client = ClientBuilder::try_from(settings)?.with_layer(&metrics.requests()).build();
-    let context = Arc::new(Context::new(client.clone(), config, metrics));
+    let (steps, stirred) = mpsc::unbounded();
+    let context = Arc::new(Context::new(client.clone(), config, metrics, steps));
     let mut metrics = tokio::spawn(metrics::serve(context.clone()));
     let Config { namespace, pod, lease, .. } = &context.config;
     leads(&context, false).await?;
@@ -118,7 +121,10 @@ async fn run() -> anyhow::Result<()> {
     let watch = || watcher::Config::default().timeout(WATCH_SECONDS);
     let jobs: Api<reconcile::Seen> = context.everywhere();
     let pods: Api<Pod> = context.everywhere();
-    let controller = Controller::new(jobs, watch())
+    let (known, writer) = reflector::store();
+    let seen = watcher(jobs, watch()).reflect(writer).applied_objects();
+    let controller = Controller::for_stream(seen.predicate_filter(trigger::stirs, Default::default()), known)
+        .reconcile_on(stirred)
         .owns(pods, watch().labels(build::LABEL))
         .with_config(controller::Config::default().concurrency(CONCURRENCY))
         .graceful_shutdown_on(terminated())

@@ -4,6 +4,7 @@ use std::collections::BTreeSet;
 use std::sync::{Arc, PoisonError, RwLock};
 use std::time::{Duration, Instant};
 
+use futures::channel::mpsc::UnboundedSender;
 use k8s_openapi::NamespaceResourceScope;
 use k8s_openapi::api::core::v1::Pod;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
@@ -15,6 +16,7 @@ use kube::core::DeserializeGuard;
 use kube::core::error_boundary::InvalidObject;
 use kube::runtime::controller::Action;
 use kube::runtime::events::{Event, EventType, Recorder, Reporter};
+use kube::runtime::reflector::ObjectRef;
 use kube::{Api, Client, Resource, ResourceExt};
 use rayherd_api::resource::{RenderJobObject, RenderJobStatus};
 use rayherd_api::{MANAGED_BY, PREVIEW, Placement, RenderJobSpec, validate};
@@ -33,6 +35,7 @@ use crate::retention::Storages;
 use crate::run;
 use crate::status;
 use crate::storage::{self, StorageError};
+use crate::trigger::Wake;
 use crate::watching::Watching;
 
 /// Field manager of everything but the ledger's pointers.
@@ -86,16 +89,18 @@ pub struct Context {
     pub events: Recorder,
     /// Counts.
     pub metrics: Metrics,
+    /// Jobs that are to be looked at before their next turn.
+    pub steps: UnboundedSender<ObjectRef<Seen>>,
 }
 
 impl Context {
     /// Nothing runs yet.
-    pub fn new(client: Client, config: Config, metrics: Metrics) -> Self {
+    pub fn new(client: Client, config: Config, metrics: Metrics, steps: UnboundedSender<ObjectRef<Seen>>) -> Self {
         let (jobs, trusted, turns, left) = (Jobs::default(), RwLock::default(), Arc::default(), Arc::default());
         let reporter = Reporter { controller: "rayherd-operator".into(), instance: Some(config.pod.clone()) };
         let events = Recorder::new(client.clone(), reporter);
         let (storages, failures, watching) = (Storages::default(), Failures::default(), Watching::default());
-        Context { client, config, jobs, trusted, turns, left, storages, failures, watching, events, metrics }
+        Context { client, config, jobs, trusted, turns, left, storages, failures, watching, events, metrics, steps }
     }
     /// Objects of every namespace that is watched.
     pub fn everywhere<K>(&self) -> Api<K>
@@ -389,7 +394,8 @@ async fn start(
     let (left, of_task) = (context.left.clone(), depot.clone());
     tokio::spawn(async move { left.find(&of_task).await });
     context.storages.add(&storage, &depot);
-    let running = run::start(context.client.clone(), job, storage, depot, context.turns.clone(), before);
+    let wake = Wake::of(&job, &context.steps);
+    let running = run::start(context.client.clone(), job, storage, depot, context.turns.clone(), before, wake);
     context.jobs.insert(uid, running.clone());
     context.metrics.started.inc();
     Ok(running)

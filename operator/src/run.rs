@@ -22,6 +22,7 @@ use tokio::runtime::Handle;
 use crate::build;
 use crate::jobs::{Before, Problem, Running, State};
 use crate::ledger::{Beside, Ledger};
+use crate::trigger::Wake;
 
 /// A store that is silent for so long is lost, and what lies on it is copied again: longer than a server takes to start anew.
 const LOST: Duration = Duration::from_secs(15);
@@ -61,7 +62,7 @@ pub fn known_scene(job: &RenderJobObject) -> Option<String> {
     status.scene.clone().filter(|_| *settings == scene_settings(&job.spec))
 }
 
-/// Starts a job. `before` is the run of an earlier spec whose workers it takes over.
+/// Starts a job. `before` is the run of an earlier spec whose workers it takes over; `wake` is for what the next step is not to wait for.
 pub fn start(
     client: Client,
     job: Arc<RenderJobObject>,
@@ -69,6 +70,7 @@ pub fn start(
     depot: Depot,
     turns: Arc<Turns>,
     before: Option<&Running>,
+    wake: Wake,
 ) -> Arc<Running> {
     let nanos = Timestamp::now().as_nanosecond();
     let slots = build::slots(&job);
@@ -97,7 +99,7 @@ pub fn start(
         prefix: prefix(job.metadata.uid.as_deref().unwrap_or_default()),
     };
     let ledger = Ledger::new(client, &job, Handle::current(), beside);
-    let keeper = Kept { ledger, running: running.clone() };
+    let keeper = Kept { ledger, running: running.clone(), wake: wake.clone() };
     let runtime = Handle::current();
     let of_thread = running.clone();
     let name = job.metadata.name.clone().unwrap_or_default();
@@ -140,6 +142,7 @@ pub fn start(
             of_thread.fleet.end();
         }
         of_thread.lock().end = Some((Timestamp::now(), result));
+        wake.now();
     };
     if let Err(e) = thread::Builder::new().name(format!("job {name}")).spawn(work) {
         let problem = Problem { message: format!("no thread for the job: {e}"), stopped: true };
@@ -151,6 +154,7 @@ pub fn start(
 struct Kept {
     ledger: Ledger,
     running: Arc<Running>,
+    wake: Wake,
 }
 
 impl Keeper for Kept {
@@ -165,8 +169,12 @@ impl Keeper for Kept {
         (state.scene, state.reused) = (Some(scene.hash.to_string()), reused);
     }
     fn cut(&self, bytes: &[u64]) {
-        self.placed(bytes);
-        self.running.lock().cut = true;
+        let by_node = self.by_node(bytes);
+        {
+            let mut state = self.running.lock();
+            (state.held, state.cut) = (by_node, true);
+        }
+        self.wake.now();
     }
     fn source(&self, bytes: &[u64]) {
         let by_node = self.by_node(bytes);
@@ -174,10 +182,12 @@ impl Keeper for Kept {
     }
     fn below(&self, what: Option<&str>) {
         self.running.lock().below = what.map(str::to_owned);
+        self.wake.now();
     }
     fn placed(&self, bytes: &[u64]) {
         let by_node = self.by_node(bytes);
         self.running.lock().held = by_node;
+        self.wake.now();
     }
     fn done(&self, _: u32, picture: &[String], report: &Report) {
         // one address of each picture is enough

@@ -3,6 +3,7 @@
 use std::sync::Arc;
 use std::time::Duration;
 
+use futures::channel::mpsc;
 use hyper::{Request, Response};
 use kube::Client;
 use kube::client::Body;
@@ -108,7 +109,7 @@ pub fn context() -> (Arc<Context>, Server) {
     };
     let metrics = Metrics::new().unwrap();
     let service = metrics.requests().layer(service);
-    (Arc::new(Context::new(Client::new(service, "default"), config, metrics)), server)
+    (Arc::new(Context::new(Client::new(service, "default"), config, metrics, mpsc::unbounded().0)), server)
 }
 
 pub fn job() -> Value {
