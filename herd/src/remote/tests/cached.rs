@@ -75,7 +75,8 @@ fn two_pictures(
 fn a_cache_of_any_size_or_none_changes_no_byte_and_a_large_one_reads_all_once() {
     let mut spec = spec(Strategy::SchedulingGridOverlapReduced, 4, 1);
     spec.workers.memory = Some("2000".parse().unwrap());
-    spec.image.size = Some("24x20".parse().unwrap());
+    spec.image.size = Some("16x12".parse().unwrap());
+    spec.sampling.spp = Some(4);
     spec.task_seconds = Some(0.05);
     let want = expected(&spec);
     let folder = tempfile::tempdir().unwrap();
