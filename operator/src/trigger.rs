@@ -86,14 +86,7 @@ mod tests {
             ("/status/ledger", json!([{"frame": 0, "sequence": 7, "record": "00"}])),
             ("/status/conditions/0/message", json!("more of the same")),
         ] {
-            let stays = if pointer.contains("conditions") {
-                let mut changed = job.clone();
-                changed["status"]["conditions"][0]["message"] = value;
-                seen(&changed)
-            } else {
-                with(pointer, value)
-            };
-            assert_eq!(stays, seen(&job), "{pointer}");
+            assert_eq!(with(pointer, value), seen(&job), "{pointer}");
         }
         for (pointer, value) in [
             ("/metadata/generation", json!(4)),
