@@ -348,6 +348,6 @@ fn a_job_file_that_swells() {
         text += &format!("a{i}: &a{i} [{names}]\n");
     }
     bounded(|| assert!(serde_yaml::from_str::<RenderJob>(&text).is_err()));
-    let deep = format!("spec: {}", "[".repeat(100_000));
+    let deep = format!("spec: {}", "[".repeat(20_000));
     bounded(|| assert!(serde_yaml::from_str::<RenderJob>(&deep).is_err()));
 }
