@@ -1,7 +1,7 @@
 //! Seeded mutations of small files, for every parser of `import`: whatever a file holds, reading it ends in records or in an
 //! error, without a panic, in bounded time and memory.
 //!
-//! 1,500 mutations a format in `cargo test`, 150 of skies; `rayherd_tests::mutation` says how to run more, or one again.
+//! 1,500 mutations a format in `cargo test`, 300 of materials and skies; `rayherd_tests::mutation` says how to run more, or one again.
 
 use std::path::Path;
 
@@ -226,7 +226,13 @@ fn mitsuba() {
 <shape type="instance"><ref id="g"/><transform name="to_world"><translate x="4"/></transform></shape>
 <shape type="instance"><ref id="g"/></shape><shape type="disk"/>
 <shape type="cylinder"><point name="p0" value="0 0 1"/><point name="p1" value="0 2 1"/><float name="radius" value="0.5"/></shape></scene>"#;
-    // every material and texture, layers
+    fuzz("a.xml", 1500, &[text.into(), more.into()], &beside(part));
+}
+
+/// Every material and texture, layers; the sky by its model, and by a picture in the other format. Fewer, as a sky and what light a rough coat lets
+/// through are computed each time.
+#[test]
+fn mitsuba_materials_and_skies() {
     let rest = r#"<scene version="3.0.0"><integrator type="aov"><string name="aovs" value="dd.y:depth, n:sh_normal"/><integrator type="path">
 <integer name="max_depth" value="-1"/></integrator></integrator>
 <sensor type="orthographic"><transform name="to_world"><scale x="3" y="3"/><translate z="-5"/></transform><float name="near_clip" value="1"/>
@@ -245,18 +251,12 @@ fn mitsuba() {
 value="ggx"/><float name="alpha_u" value="0.1"/><float name="alpha_v" value="0.2"/></bsdf></shape>
 <shape type="disk"><bsdf type="null"/></shape><shape type="cube"><bsdf type="thindielectric"/></shape>
 <shape type="cube"><bsdf type="plastic"><boolean name="nonlinear" value="true"/></bsdf></shape></scene>"#;
-    fuzz("a.xml", 1500, &[text.into(), more.into(), rest.into()], &beside(part));
-}
-
-/// The sky by its model, and by a picture in the other format: fewer, as the model is computed each time.
-#[test]
-fn mitsuba_skies() {
     let sunsky = r#"<scene version="3.0.0"><emitter type="sunsky"><float name="turbidity" value="4"/>
 <vector name="sun_direction" x="0.1" y="0.2" z="0.9"/></emitter><sensor type="perspective"/><shape type="cube"/></scene>"#;
     let envmap = "<scene version=\"0.6.0\"><sensor type=\"perspective\"/><shape type=\"cube\"><bsdf type=\"roughconductor\"><spectrum name=\"eta\" \
                   value=\"1.5\"/><string name=\"material\" value=\"Cu\"/></bsdf></shape><emitter type=\"envmap\"><string name=\"filename\" \
                   value=\"sky.exr\"/></emitter></scene>";
-    fuzz("b.xml", 150, &[sunsky.into(), envmap.into()], &beside(""));
+    fuzz("b.xml", 300, &[rest.into(), sunsky.into(), envmap.into()], &beside(""));
 }
 
 /// What scenes name: their files, and another XML.

@@ -185,17 +185,27 @@ impl Fleet {
         self.wanted.notify_waiters();
     }
 
-    /// Answers a worker that asks for work; after `patience` with [`Answer::Wait`].
+    /// Answers a worker that asks for work; after `patience`, or when it is thought gone or replaced meanwhile, with [`Answer::Wait`]: to wait is no
+    /// sign of life, and must not cost a successor what it does.
     ///
     /// # Errors
     /// When there is no worker of this number.
     pub async fn poll(&self, poll: &Poll, patience: Duration) -> Result<Answer, Unknown> {
         let end = tokio::time::Instant::now() + patience;
+        let mut asks = true;
         loop {
             let wanted = self.wanted.notified();
             tokio::pin!(wanted);
             wanted.as_mut().enable();
-            let answer = self.answer(poll)?;
+            let answer = if std::mem::take(&mut asks) {
+                self.answer(poll)?
+            } else {
+                let mut state = self.lock();
+                if !state.knows(&poll.worker) {
+                    return Ok(Answer::Wait);
+                }
+                give(&mut state, poll)?
+            };
             if answer != Answer::Wait || self.lock().retired || tokio::time::timeout_at(end, wanted).await.is_err() {
                 return Ok(answer);
             }
@@ -212,47 +222,7 @@ impl Fleet {
         if newcomer {
             self.told.notify_all();
         }
-        if state.over {
-            return Ok(Answer::Over);
-        }
-        let can = |stage: &Stage| poll.picture == PICTURE && (poll.aovs || stage.frame.aovs.is_empty());
-        let unfit = !state.stage.as_ref().is_none_or(can);
-        if unfit {
-            state.set_unfit(poll.worker.number);
-            return Ok(Answer::Wait);
-        }
-        if state.stage.as_ref().map(|s| &s.id) != poll.stage.as_ref() {
-            return Ok(Answer::Open { stage: state.stage.clone().map(Box::new) });
-        }
-        let id = format!("{}-{}", state.epoch, state.next);
-        let level = state.deaths.level();
-        let in_stage = poll.stage.is_some();
-        let worker = state.workers[poll.worker.number as usize].as_mut().ok_or(Unknown)?;
-        worker.open |= in_stage;
-        worker.bands = poll.bands;
-        worker.told(poll.holds.as_ref());
-        let first = state.common_for(poll);
-        let (what, work) = if let Some((call, work)) = first.and_then(|at| state.common.remove(at)) {
-            (What::Call { call, work: work.clone() }, work)
-        } else if !poll.clerk
-            && let Some((task, number, work, stop)) =
-                state.workers[poll.worker.number as usize].as_mut().and_then(|w| w.ready.pop_front())
-        {
-            state.tally.first_attempt.get_or_insert_with(Instant::now);
-            (What::Attempt { task, number, stop }, work)
-        } else if poll.clerk
-            && poll.previews
-            && let Some(work) = state.preview.waiting.take()
-        {
-            state.preview.made = true;
-            (What::Preview { stop: Default::default() }, work)
-        } else {
-            return Ok(Answer::Wait);
-        };
-        state.next += 1;
-        let held = Held { keys: keys(&work), level: matches!(what, What::Attempt { .. }).then_some(level) };
-        state.doing.insert(id.clone(), Doing { worker: poll.worker.number, since: Instant::now(), what, held });
-        Ok(Answer::Work { id, work: Box::new(work) })
+        give(&mut state, poll)
     }
 
     /// Takes a report; false when nobody waits for it (any more): the work is garbage.
@@ -441,6 +411,51 @@ impl Fleet {
     fn wait<'s>(&self, state: MutexGuard<'s, State>, time: Duration) -> MutexGuard<'s, State> {
         self.told.wait_timeout(state, time).unwrap_or_else(PoisonError::into_inner).0
     }
+}
+
+/// What a worker that is there is given to do.
+fn give(state: &mut State, poll: &Poll) -> Result<Answer, Unknown> {
+    if state.over {
+        return Ok(Answer::Over);
+    }
+    let can = |stage: &Stage| poll.picture == PICTURE && (poll.aovs || stage.frame.aovs.is_empty());
+    let unfit = !state.stage.as_ref().is_none_or(can);
+    if unfit {
+        state.set_unfit(poll.worker.number);
+        return Ok(Answer::Wait);
+    }
+    if state.stage.as_ref().map(|s| &s.id) != poll.stage.as_ref() {
+        return Ok(Answer::Open { stage: state.stage.clone().map(Box::new) });
+    }
+    let id = format!("{}-{}", state.epoch, state.next);
+    let level = state.deaths.level();
+    let in_stage = poll.stage.is_some();
+    let worker = state.workers[poll.worker.number as usize].as_mut().ok_or(Unknown)?;
+    worker.open |= in_stage;
+    worker.bands = poll.bands;
+    worker.told(poll.holds.as_ref());
+    let first = state.common_for(poll);
+    let (what, work) = if let Some((call, work)) = first.and_then(|at| state.common.remove(at)) {
+        (What::Call { call, work: work.clone() }, work)
+    } else if !poll.clerk
+        && let Some((task, number, work, stop)) =
+            state.workers[poll.worker.number as usize].as_mut().and_then(|w| w.ready.pop_front())
+    {
+        state.tally.first_attempt.get_or_insert_with(Instant::now);
+        (What::Attempt { task, number, stop }, work)
+    } else if poll.clerk
+        && poll.previews
+        && let Some(work) = state.preview.waiting.take()
+    {
+        state.preview.made = true;
+        (What::Preview { stop: Default::default() }, work)
+    } else {
+        return Ok(Answer::Wait);
+    };
+    state.next += 1;
+    let held = Held { keys: keys(&work), level: matches!(what, What::Attempt { .. }).then_some(level) };
+    state.doing.insert(id.clone(), Doing { worker: poll.worker.number, since: Instant::now(), what, held });
+    Ok(Answer::Work { id, work: Box::new(work) })
 }
 
 /// What helps where a pod's memory is too little.

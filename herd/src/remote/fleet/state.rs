@@ -188,6 +188,11 @@ impl State {
         Ok(newcomer)
     }
 
+    /// Whether this one has its number, and is not thought gone.
+    pub fn knows(&self, worker: &WorkerId) -> bool {
+        self.workers.get(worker.number as usize).and_then(Option::as_ref).is_some_and(|w| w.session == worker.session)
+    }
+
     /// Notes a sign of life; whether it is of the worker that has this number. Only who asks for work takes over the number of another: one that
     /// was thought dead, and was replaced, has nothing to report, and must not cost its successor what it does.
     pub fn hear(&mut self, worker: &WorkerId) -> Result<bool, Unknown> {

@@ -204,6 +204,36 @@ fn workers_that_wait_are_sent_to_the_next_fleet_at_once() {
     assert_eq!(waits, Ok(Answer::Wait));
 }
 
+/// A pod that is gone has a connection left, on which it asked for work: it gets none, and takes nothing from the pod that comes after it.
+#[test]
+fn who_waited_while_it_was_replaced_has_nothing_and_costs_nothing() {
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_time().build().unwrap();
+    for replaced in [true, false] {
+        let fleet = Fleet::new(1, "e");
+        let (old, new) = (poll(0, "old"), poll(0, "new"));
+        let launch = |task| {
+            let attempt =
+                Attempt { name: "a".into(), node: 0, set: Set::Reduce, groups: Vec::new(), camera: Vec::new() };
+            fleet.launch(Launch { task: TaskId(task), number: 0, attempt, stop: StopFlag::default() });
+        };
+        let meanwhile = async {
+            tokio::task::yield_now().await;
+            if replaced {
+                assert_eq!(fleet.answer(&new), Ok(Answer::Wait));
+            } else {
+                gone(&fleet, 0, "old");
+            }
+            launch(1);
+        };
+        // far longer than a test may take
+        let waiting = fleet.poll(&old, Duration::from_secs(3600));
+        let (answer, ()) = runtime.block_on(futures::future::join(waiting, meanwhile));
+        assert_eq!(answer, Ok(Answer::Wait));
+        assert_eq!(fleet.tally().outcomes, BTreeMap::new(), "no attempt was begun");
+        assert_eq!(given(fleet.answer(&new).unwrap()).is_some(), replaced);
+    }
+}
+
 /// Another attempt has done the task, and what this one read was deleted: no work is lost.
 #[test]
 fn an_attempt_that_was_beaten_and_finds_its_input_gone_is_none_that_is_lost() {
