@@ -116,7 +116,8 @@ fn a_texture_reaches_its_parameter_alone() {
                 reached += 1;
             }
             assert_eq!(fields(&found), expected, "{slot:?} of {bsdf:?}");
-            if material.has_look() {
+            if let Some(kind) = material.kind() {
+                assert_eq!(Kind::ALL[kind.number()], kind);
                 let look = material.look(&textures, &NoTextures, at, &textures[0].spot(at));
                 let even = Material::new("", found, true).even_look();
                 assert_eq!(format!("{look:?}"), format!("{even:?}"), "{slot:?}");

@@ -42,20 +42,53 @@ pub(crate) struct Metal {
     pub specular: [f32; 3],
 }
 
-impl Material {
-    /// Whether [`Material::look`] says something, at every place.
+/// What has to be computed for a vertex: those of one kind share a block.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Kind {
+    /// [`Look::Diffuse`].
+    Diffuse,
+    /// [`Look::Coat`].
+    Coat(Distribution),
+    /// [`Look::Metal`].
+    Metal(Distribution),
+}
+
+impl Kind {
+    /// Every kind.
+    pub(crate) const ALL: [Kind; 5] = [
+        Kind::Diffuse,
+        Kind::Coat(Distribution::Ggx),
+        Kind::Coat(Distribution::Beckmann),
+        Kind::Metal(Distribution::Ggx),
+        Kind::Metal(Distribution::Beckmann),
+    ];
+
+    /// Its place among all.
     #[inline(always)]
-    pub(crate) fn has_look(&self) -> bool {
-        let is_known = match &self.bsdf {
-            Bsdf::Diffuse { .. } | Bsdf::RoughPlastic { .. } => true,
-            Bsdf::RoughConductor { alpha, .. } => alpha[0] == alpha[1],
-            _ => false,
+    pub(crate) fn number(self) -> usize {
+        match self {
+            Kind::Diffuse => 0,
+            Kind::Coat(distribution) => 1 + usize::from(distribution == Distribution::Beckmann),
+            Kind::Metal(distribution) => 3 + usize::from(distribution == Distribution::Beckmann),
+        }
+    }
+}
+
+impl Material {
+    /// The kind of [`Material::look`], if that says something at every place.
+    #[inline(always)]
+    pub(crate) fn kind(&self) -> Option<Kind> {
+        let kind = match &self.bsdf {
+            Bsdf::Diffuse { .. } => Kind::Diffuse,
+            Bsdf::RoughPlastic { distribution, .. } => Kind::Coat(*distribution),
+            Bsdf::RoughConductor { distribution, alpha, .. } if alpha[0] == alpha[1] => Kind::Metal(*distribution),
+            _ => return None,
         };
         let is_paint = |detail: &Detail| {
             let turns = |t: &Textured| matches!(t.slot, Slot::AlphaU | Slot::AlphaV);
             detail.is_paint() && !detail.textured.iter().any(turns)
         };
-        is_known && self.detail.as_deref().is_none_or(is_paint)
+        self.detail.as_deref().is_none_or(is_paint).then_some(kind)
     }
 
     /// The model as a block takes it, textures aside; `None` where there is more to it.
@@ -79,7 +112,7 @@ impl Material {
         })
     }
 
-    /// The model at a place, of a material that [`Material::has_look`]. `first`: what the first of its textures reads there.
+    /// The model at a place, of a material that has a [`Material::kind`]. `first`: what the first of its textures reads there.
     #[inline(always)]
     pub(crate) fn look(&self, textures: &[Texture], tiles: &dyn Textures, at: At, first: &Spot) -> Option<Look> {
         let mut look = self.even_look()?;

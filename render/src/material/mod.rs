@@ -23,7 +23,7 @@ mod tests;
 use serde::{Deserialize, Serialize};
 
 pub use detail::{Amount, Blend, Detail, Relief, ReliefKind, Slot, Textured};
-pub(crate) use gloss::{Coat, Look, Metal};
+pub(crate) use gloss::{Coat, Kind, Look, Metal};
 pub use plastic::Transmittance;
 pub use principled::Principled;
 

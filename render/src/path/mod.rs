@@ -179,7 +179,8 @@ impl<'a> Context<'a> {
     }
 }
 
-/// What a batch became. Vectors are appended to, in the order of the rays; clear and use again.
+/// What a batch became. Vectors are appended to, in an order that depends on nothing but the batch: vertices of one kind together, as far as they are
+/// shaded together. Clear and use again.
 #[derive(Clone, Debug, Default)]
 pub struct Outcome {
     /// For the film.
@@ -196,7 +197,7 @@ pub struct Outcome {
     pub counters: Counters,
     /// Memory that `shade` keeps between calls.
     #[cfg(not(feature = "double"))]
-    block: Option<Box<block::Block>>,
+    blocks: Option<Box<block::Blocks>>,
     #[cfg(not(feature = "double"))]
     rays: Vec<Ray>,
 }

@@ -1,7 +1,7 @@
 //! Shading of a batch.
 
 #[cfg(not(feature = "double"))]
-use super::block::Block;
+use super::block::{Block, Blocks};
 use super::interaction::{Interaction, triangle_place};
 use super::vertex::{Fate, cosine_direction, onwards, snap, survive, towards_light};
 use super::{Context, Contribution, Outcome, PathRay, ShadowRay, Surface, Surfaces, power_heuristic};
@@ -40,7 +40,7 @@ pub fn shade_traced<S: Surfaces>(
     hits: &[Hit],
     out: &mut Outcome,
 ) {
-    let mut block = out.block.take().unwrap_or_default();
+    let mut blocks = out.blocks.take().unwrap_or_default();
     out.counters.shaded += rays.len() as u64;
     let looks_up = looks_up(context);
     let bares = context.skips.makes(Skip::Details);
@@ -63,24 +63,23 @@ pub fn shade_traced<S: Surfaces>(
             }
             continue;
         }
-        let Some(Leaving { shape, material, children, throughput }) = arrive(context, surfaces, index, ray, hit, out)
-        else {
-            continue;
-        };
-        for child in 0..children {
+        let Some(leaving) = arrive(context, surfaces, index, ray, hit, out) else { continue };
+        for child in 0..leaving.children {
             let key = PathKey { branch: ray.key.branch + child as u16, ..ray.key };
-            block.push(index as u32, key, throughput);
             // where nothing is to be skipped by way of `scatter_plain`, which looks for detail
-            if bares {
-                enter(context, surfaces, index, hit, traced.d, shape, material, &mut block);
-            }
-            if block.is_full() {
-                flush(context, surfaces, rays, hits, &mut block, out);
+            let block =
+                if bares { enter(context, surfaces, index, hit, traced.d, key, leaving, &mut blocks) } else { None };
+            match block {
+                None => one_by_one(context, surfaces, rays, hits, index, key, leaving.throughput, out),
+                Some(block) if block.is_full() => flush(context, surfaces, rays, hits, block, out),
+                Some(_) => {}
             }
         }
     }
-    flush(context, surfaces, rays, hits, &mut block, out);
-    out.block = Some(block);
+    for block in blocks.all() {
+        flush(context, surfaces, rays, hits, block, out);
+    }
+    out.blocks = Some(blocks);
 }
 
 /// What rays that missed bring of a sky that lies in memory far away, some at a time.
@@ -143,11 +142,26 @@ fn flush<S: Surfaces>(
     out: &mut Outcome,
 ) {
     block.flush(context, out, |index, key, throughput, out| {
-        let (ray, hit) = (&rays[index], &hits[index]);
-        let (surface, world) = (surfaces.surface(index, hit), context.world);
-        let material = &world.materials[world.shapes[surfaces.shape(index, hit) as usize].material as usize];
-        scatter_plain(context, ray, key, throughput, hit, &surface, material, out);
+        one_by_one(context, surfaces, rays, hits, index, key, throughput, out);
     });
+}
+
+#[cfg(not(feature = "double"))]
+#[inline(never)]
+fn one_by_one<S: Surfaces>(
+    context: &Context,
+    surfaces: &S,
+    rays: &[PathRay],
+    hits: &[Hit],
+    index: usize,
+    key: PathKey,
+    throughput: Vec3,
+    out: &mut Outcome,
+) {
+    let (ray, hit) = (&rays[index], &hits[index]);
+    let (surface, world) = (surfaces.surface(index, hit), context.world);
+    let material = &world.materials[world.shapes[surfaces.shape(index, hit) as usize].material as usize];
+    scatter_plain(context, ray, key, throughput, hit, &surface, material, out);
 }
 
 /// Whether the sky is looked up where nothing is met.
@@ -173,6 +187,7 @@ fn emit(ray: &PathRay, radiance: Vec3, light_pdf: f32, out: &mut Outcome) {
 }
 
 /// What leaves from a hit.
+#[derive(Clone, Copy)]
 struct Leaving<'a> {
     /// Of this shape.
     shape: u32,
@@ -184,31 +199,35 @@ struct Leaving<'a> {
 }
 
 #[cfg(not(feature = "double"))]
-/// Gives the last vertex of a block its surface, if the block takes it: written where it is to stay, as copies of what was just written wait for it.
+/// Puts a vertex into the block of its kind, if there is one: written where it is to stay, as copies of what was just written wait for it.
 #[inline(always)]
-fn enter<S: Surfaces>(
+fn enter<'b, S: Surfaces>(
     context: &Context,
     surfaces: &S,
     index: usize,
     hit: &Hit,
     d: [f32; 3],
-    shape: u32,
-    material: &Material,
-    block: &mut Block,
-) {
+    key: PathKey,
+    leaving: Leaving,
+    blocks: &'b mut Blocks,
+) -> Option<&'b mut Block> {
     // most hits of most scenes
+    let material = leaving.material;
     if let (Bsdf::Diffuse { reflectance }, None) = (&material.bsdf, &material.detail)
         && let Surface { geometry: Primitive::Triangle(vertices), normals: None, .. } = surfaces.surface(index, hit)
     {
+        let block = &mut blocks.diffuse;
+        block.push(index as u32, key, leaving.throughput);
         block.set_triangle(&vertices, hit, d, material.two_sided);
         block.set_albedo(*reflectance);
-    } else if material.has_look() {
-        enter_with_look(context, surfaces, index, hit, d, shape, material, block);
+        return Some(block);
     }
+    let block = blocks.of(material.kind()?);
+    enter_with_look(context, surfaces, index, hit, d, key, leaving, block).then_some(block)
 }
 
 #[cfg(not(feature = "double"))]
-/// The same of every look, with shading normals and textures.
+/// The same of every look, with shading normals and textures; whether the block takes it.
 #[inline(never)]
 fn enter_with_look<S: Surfaces>(
     context: &Context,
@@ -216,12 +235,12 @@ fn enter_with_look<S: Surfaces>(
     index: usize,
     hit: &Hit,
     d: [f32; 3],
-    shape: u32,
-    material: &Material,
+    key: PathKey,
+    Leaving { shape, material, throughput, .. }: Leaving,
     block: &mut Block,
-) {
+) -> bool {
     let surface = surfaces.surface(index, hit);
-    let Primitive::Triangle(vertices) = &surface.geometry else { return };
+    let Primitive::Triangle(vertices) = &surface.geometry else { return false };
     match &material.detail {
         Some(detail) if !detail.textured.is_empty() => {
             let place = triangle_place(&surface, hit);
@@ -232,10 +251,12 @@ fn enter_with_look<S: Surfaces>(
                 texture.foresee(context.textures, &spot);
                 first.get_or_insert(spot);
             }
+            block.push(index as u32, key, throughput);
             block.set_place(shape, place, first.unwrap_or_default());
         }
         _ => {
-            let Some(look) = material.even_look() else { return };
+            let Some(look) = material.even_look() else { return false };
+            block.push(index as u32, key, throughput);
             block.set_look(shape, &look);
         }
     }
@@ -243,6 +264,7 @@ fn enter_with_look<S: Surfaces>(
     if let Some(normals) = &surface.normals {
         block.set_normals(normals);
     }
+    true
 }
 
 /// Emission, depth and splitting; `None` when the path ends here.

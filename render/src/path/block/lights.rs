@@ -10,10 +10,17 @@ use crate::path::vertex::select;
 impl Block {
     #[inline(always)]
     pub(super) fn choose_lights(&mut self, context: &Context) {
+        let any_triangle = |few: &[FewLight]| few.iter().any(|light| matches!(light.shape, FewShape::Triangle(_)));
         match context.lights.few() {
-            Some(Few::ByPower(few)) => return self.choose_by_power(few),
-            Some(Few::ByPlace(node, few)) => return self.choose_by_place(node, few),
-            None => {}
+            Some(Few::ByPower(few)) => {
+                self.any_triangle = any_triangle(few);
+                return self.choose_by_power(few);
+            }
+            Some(Few::ByPlace(node, few)) => {
+                self.any_triangle = any_triangle(few);
+                return self.choose_by_place(node, few);
+            }
+            None => self.any_triangle = false,
         }
         for i in 0..self.len {
             self.is_ball[i] = false;
@@ -38,6 +45,7 @@ impl Block {
                 }
                 continue;
             };
+            self.any_triangle = true;
             self.light_p0.set(i, triangle.p0);
             self.light_e1.set(i, triangle.e1);
             self.light_e2.set(i, triangle.e2);
@@ -141,8 +149,13 @@ impl Block {
         }
     }
 
+    /// Points on triangles, where one was chosen.
     #[inline(always)]
-    pub(super) fn sample_lights(&mut self) {
+    pub(super) fn sample_triangles(&mut self) {
+        if !self.any_triangle {
+            self.lit = [false; N];
+            return;
+        }
         for i in 0..N {
             let light = TriangleLight {
                 p0: self.light_p0.get(i),
@@ -154,8 +167,7 @@ impl Block {
             };
             let o = self.origin.get(i);
             let (place, warp) = light.warp(o, Facing::front(self.shading.get(i)), [self.place[0][i], self.place[1][i]]);
-            let worth = self.worth[i] * if self.is_ball[i] { 1.0 } else { warp };
-            self.arriving.set(i, self.radiance.get(i) * worth);
+            self.arriving.set(i, self.radiance.get(i) * (self.worth[i] * warp));
             let (d, tmax, pdf, ok) = light.sample_or_not(o, place);
             self.light_d.set(i, d);
             self.light_tmax[i] = tmax;
@@ -175,6 +187,8 @@ impl Block {
             let o = self.origin.get(i);
             let (d, tmax, pdf) = sphere.sample_outside(o, [self.place[0][i], self.place[1][i]]);
             let yes = self.is_ball[i];
+            let arriving = self.radiance.get(i) * self.worth[i];
+            self.arriving.set(i, select(yes, arriving, self.arriving.get(i)));
             let lit = sphere.is_lit_outside(o) & (self.probability[i] > 0.0);
             self.light_d.set(i, select(yes, d, self.light_d.get(i)));
             self.light_tmax[i] = if yes { tmax } else { self.light_tmax[i] };

@@ -1,35 +1,24 @@
-//! Rough coats and rough metals among the vertices: computed for all where there is one of its kind, taken where it is one.
+//! What the models make of the vertices: one kind a block.
 
 use glam::Vec3;
 
 use super::{Block, Lanes, N};
-use crate::material::{Coat, Distribution, Look, Metal, Scatter};
+use crate::material::{Coat, Distribution, Kind, Look, Metal, Scatter};
 use crate::math::Basis;
 use crate::path::Context;
-use crate::path::vertex::{scattered_light, scattered_onwards, select};
+use crate::path::vertex::{cosine_direction, onwards, scattered_light, scattered_onwards, towards_light};
 
-/// Calls a method for GGX and for Beckmann's distribution where the block has vertices of that kind.
-macro_rules! each {
-    ($block:ident . $kind:ident : $method:ident ( $($with:expr),* )) => {
-        if $block.kinds.$kind[0] {
-            $block.$method::<false>($($with),*);
-        }
-        if $block.kinds.$kind[1] {
-            $block.$method::<true>($($with),*);
-        }
-    };
-}
+/// Whether the distribution is Beckmann's.
+const GGX: bool = false;
+const BECKMANN: bool = true;
 
 impl Block {
-    /// Notes the model of a vertex.
+    /// Notes the parameters of a vertex, which is of the block's kind.
     #[inline(always)]
     pub(super) fn note_look(&mut self, i: usize, look: &Look) {
         match look {
             Look::Diffuse(reflectance) => self.reflectance.set(i, (*reflectance).into()),
             Look::Coat(coat) => {
-                let beckmann = coat.distribution == Distribution::Beckmann;
-                (self.is_coat[i], self.is_beckmann[i]) = (true, beckmann);
-                self.kinds.coat[usize::from(beckmann)] = true;
                 self.alpha[i] = coat.alpha;
                 self.eta.0[0][i] = coat.eta;
                 self.reflectance.set(i, coat.diffuse.into());
@@ -38,9 +27,6 @@ impl Block {
                 self.internal[i] = coat.internal;
             }
             Look::Metal(metal) => {
-                let beckmann = metal.distribution == Distribution::Beckmann;
-                (self.is_metal[i], self.is_beckmann[i]) = (true, beckmann);
-                self.kinds.metal[usize::from(beckmann)] = true;
                 self.alpha[i] = metal.alpha;
                 self.eta.set(i, metal.eta.into());
                 self.k.set(i, metal.k.into());
@@ -51,56 +37,87 @@ impl Block {
 
     /// What enters the coats towards where the path came from.
     #[inline(always)]
-    pub(super) fn lobes_enter(&mut self, context: &Context) {
-        if self.kinds.coat == [false; 2] {
-            return;
+    pub(super) fn enter(&mut self, context: &Context) {
+        if let Kind::Coat(_) = self.kind {
+            let mut cosines = [0.0; N];
+            for i in 0..N {
+                cosines[i] = self.shading.get(i).dot(-self.d.get(i));
+            }
+            self.entering = self.shares_of_coats(context, &cosines);
         }
-        let mut cosines = [0.0; N];
-        for i in 0..N {
-            cosines[i] = self.shading.get(i).dot(-self.d.get(i));
-        }
-        self.entering = self.shares_of_coats(context, &cosines);
     }
 
     /// Contributions of the shadow rays.
     #[inline(always)]
-    pub(super) fn lobes_towards_lights(&mut self, context: &Context) {
-        if self.kinds.coat != [false; 2] {
+    pub(super) fn towards_lights(&mut self, context: &Context) {
+        if let Kind::Coat(_) = self.kind {
             for i in 0..N {
                 self.leaving[i] = self.shading.get(i).dot(self.shadow_d.get(i));
             }
             self.leaving = self.shares_of_coats(context, &self.leaving);
         }
-        each!(self.coat: coats_towards_lights());
-        each!(self.metal: metals_towards_lights());
+        match self.kind {
+            Kind::Diffuse => self.diffuse_towards_lights(),
+            Kind::Coat(Distribution::Ggx) => self.coats_towards_lights::<GGX>(),
+            Kind::Coat(Distribution::Beckmann) => self.coats_towards_lights::<BECKMANN>(),
+            Kind::Metal(Distribution::Ggx) => self.metals_towards_lights::<GGX>(),
+            Kind::Metal(Distribution::Beckmann) => self.metals_towards_lights::<BECKMANN>(),
+        }
     }
 
     /// Next directions, before snapping.
     #[inline(always)]
-    pub(super) fn lobes_directions(&mut self) {
-        each!(self.coat: coats_directions());
-        each!(self.metal: metals_directions());
+    pub(super) fn directions(&mut self) {
+        match self.kind {
+            Kind::Diffuse => self.diffuse_directions(),
+            Kind::Coat(Distribution::Ggx) => self.coats_directions::<GGX>(),
+            Kind::Coat(Distribution::Beckmann) => self.coats_directions::<BECKMANN>(),
+            Kind::Metal(Distribution::Ggx) => self.metals_directions::<GGX>(),
+            Kind::Metal(Distribution::Beckmann) => self.metals_directions::<BECKMANN>(),
+        }
     }
 
     /// What becomes of paths in their next directions.
     #[inline(always)]
-    pub(super) fn lobes_onwards(&mut self, context: &Context) {
-        if self.kinds.coat != [false; 2] {
+    pub(super) fn onwards(&mut self, context: &Context) {
+        if let Kind::Coat(_) = self.kind {
             for i in 0..N {
                 self.leaving[i] = self.shading.get(i).dot(self.next_d.get(i));
             }
             self.leaving = self.shares_of_coats(context, &self.leaving);
         }
-        each!(self.coat: coats_onwards());
-        each!(self.metal: metals_onwards());
+        match self.kind {
+            Kind::Diffuse => self.diffuse_onwards(),
+            Kind::Coat(Distribution::Ggx) => self.coats_onwards::<GGX>(),
+            Kind::Coat(Distribution::Beckmann) => self.coats_onwards::<BECKMANN>(),
+            Kind::Metal(Distribution::Ggx) => self.metals_onwards::<GGX>(),
+            Kind::Metal(Distribution::Beckmann) => self.metals_onwards::<BECKMANN>(),
+        }
+    }
+
+    #[inline(always)]
+    fn diffuse_towards_lights(&mut self) {
+        for i in 0..N {
+            let contribution = towards_light(
+                self.throughput.get(i),
+                self.reflectance.get(i),
+                self.normal.get(i),
+                self.shading.get(i),
+                self.light_d.get(i),
+                self.shadow_d.get(i),
+                self.light_pdf[i],
+                self.arriving.get(i),
+                self.lit[i] & self.seen[i],
+            );
+            self.contribution.set(i, contribution);
+        }
     }
 
     #[inline(always)]
     fn coats_towards_lights<const BECKMANN: bool>(&mut self) {
         for i in 0..N {
             let scatter = self.coat_scatters::<BECKMANN>(i, self.shadow_d.get(i));
-            let yes = self.is_coat[i] & (self.is_beckmann[i] == BECKMANN);
-            self.contribution.set(i, select(yes, self.lobe_light(i, scatter), self.contribution.get(i)));
+            self.contribution.set(i, self.lobe_light(i, scatter));
         }
     }
 
@@ -108,8 +125,16 @@ impl Block {
     fn metals_towards_lights<const BECKMANN: bool>(&mut self) {
         for i in 0..N {
             let scatter = self.metal_scatters::<BECKMANN>(i, self.shadow_d.get(i));
-            let yes = self.is_metal[i] & (self.is_beckmann[i] == BECKMANN);
-            self.contribution.set(i, select(yes, self.lobe_light(i, scatter), self.contribution.get(i)));
+            self.contribution.set(i, self.lobe_light(i, scatter));
+        }
+    }
+
+    #[inline(always)]
+    fn diffuse_directions(&mut self) {
+        for i in 0..N {
+            let (d, above) = cosine_direction(self.shading.get(i), [self.direction[0][i], self.direction[1][i]]);
+            self.next_d.set(i, d);
+            self.above[i] = above & self.seen[i];
         }
     }
 
@@ -119,8 +144,8 @@ impl Block {
             let basis = Basis::new(self.shading.get(i));
             let (wo, u) = (basis.to_local(-self.d.get(i)), [self.direction[0][i], self.direction[1][i]]);
             let (wi, counts) = self.coat::<BECKMANN>(i).sample(self.entering[i], wo, u, self.lobe[i]);
-            let yes = self.is_coat[i] & (self.is_beckmann[i] == BECKMANN);
-            self.take_direction(i, basis.to_world(wi), counts, yes);
+            self.next_d.set(i, basis.to_world(wi));
+            self.above[i] = counts & self.seen[i];
         }
     }
 
@@ -130,8 +155,27 @@ impl Block {
             let basis = Basis::new(self.shading.get(i));
             let (wo, u) = (basis.to_local(-self.d.get(i)), [self.direction[0][i], self.direction[1][i]]);
             let (wi, counts) = self.metal::<BECKMANN>(i).sample(wo, u);
-            let yes = self.is_metal[i] & (self.is_beckmann[i] == BECKMANN);
-            self.take_direction(i, basis.to_world(wi), counts, yes);
+            self.next_d.set(i, basis.to_world(wi));
+            self.above[i] = counts & self.seen[i];
+        }
+    }
+
+    #[inline(always)]
+    fn diffuse_onwards(&mut self) {
+        for i in 0..N {
+            let (throughput, pdf, fate) = onwards(
+                self.throughput.get(i),
+                self.reflectance.get(i),
+                self.normal.get(i),
+                self.shading.get(i),
+                self.next_d.get(i),
+                self.above[i],
+                self.go_on[i],
+                self.roulette[i],
+            );
+            self.next_throughput.set(i, throughput);
+            self.next_pdf[i] = pdf;
+            self.fate[i] = fate;
         }
     }
 
@@ -139,7 +183,7 @@ impl Block {
     fn coats_onwards<const BECKMANN: bool>(&mut self) {
         for i in 0..N {
             let scatter = self.coat_scatters::<BECKMANN>(i, self.next_d.get(i));
-            self.take_onwards(i, scatter, self.is_coat[i] & (self.is_beckmann[i] == BECKMANN));
+            self.take_onwards(i, scatter);
         }
     }
 
@@ -147,7 +191,7 @@ impl Block {
     fn metals_onwards<const BECKMANN: bool>(&mut self) {
         for i in 0..N {
             let scatter = self.metal_scatters::<BECKMANN>(i, self.next_d.get(i));
-            self.take_onwards(i, scatter, self.is_metal[i] & (self.is_beckmann[i] == BECKMANN));
+            self.take_onwards(i, scatter);
         }
     }
 
@@ -157,7 +201,7 @@ impl Block {
         let world = context.world;
         let mut out = [0.0; N];
         for i in 0..self.len {
-            if self.is_coat[i] {
+            if !self.passes[i] {
                 let material = &world.materials[world.shapes[self.shape[i] as usize].material as usize];
                 out[i] = material.coat().map_or(0.0, |coat| coat.at(cosines[i]));
             }
@@ -218,13 +262,7 @@ impl Block {
     }
 
     #[inline(always)]
-    fn take_direction(&mut self, i: usize, d: Vec3, counts: bool, yes: bool) {
-        self.next_d.set(i, select(yes, d, self.next_d.get(i)));
-        self.above[i] = (yes & counts & self.seen[i]) | (!yes & self.above[i]);
-    }
-
-    #[inline(always)]
-    fn take_onwards(&mut self, i: usize, scatter: Scatter, yes: bool) {
+    fn take_onwards(&mut self, i: usize, scatter: Scatter) {
         let (throughput, pdf, fate) = scattered_onwards(
             self.throughput.get(i),
             scatter,
@@ -234,9 +272,9 @@ impl Block {
             self.go_on[i],
             self.roulette[i],
         );
-        self.next_throughput.set(i, select(yes, throughput, self.next_throughput.get(i)));
-        self.next_pdf[i] = if yes { pdf } else { self.next_pdf[i] };
-        self.fate[i] = if yes { fate } else { self.fate[i] };
+        self.next_throughput.set(i, throughput);
+        self.next_pdf[i] = pdf;
+        self.fate[i] = fate;
     }
 }
 

@@ -1,8 +1,8 @@
 //! Many vertices at once: triangles that are diffuse, or have one isotropic lobe, in arrays that the compiler turns into vector code.
 //!
-//! Vertices are collected in the order of their rays, up to [`N`]; then each phase runs over all of them. What a phase does to one vertex is
-//! the same inlined code that the plain way runs (`shade::scatter_plain`), so the bits are the same, and a test compares them. Other
-//! surfaces pass through and are shaded the plain way in their turn, so that the order of what comes out is that of the rays.
+//! Vertices are collected by their kind, up to [`N`] of each; then each phase runs over all of them. What a phase does to one vertex is
+//! the same inlined code that the plain way runs (`shade::scatter_plain`), so the bits are the same, and a test compares them. What a block
+//! cannot take after all passes through, and is shaded the plain way in its turn.
 
 mod lights;
 mod lobes;
@@ -10,10 +10,10 @@ mod lobes;
 use glam::Vec3;
 
 use super::interaction::{Flat, smooth};
-use super::vertex::{Fate, cosine_direction, onwards, select, snap, towards_light};
+use super::vertex::{Fate, select, snap};
 use super::{Context, Outcome, PathRay, ShadowRay, wide};
 use crate::light::Choice;
-use crate::material::Look;
+use crate::material::{Kind, Look};
 use crate::math::{UnitDir, offset_origin, unit};
 use crate::ray::{Hit, PathKey, Ray};
 use crate::sampler::{BSDF, LIGHT, LIGHT_CHOICE, LOBE, ROULETTE, Streams};
@@ -44,19 +44,46 @@ impl Lanes3 {
     }
 }
 
-/// What some vertex of a block has that not all have.
-#[derive(Clone, Copy, Debug, Default)]
-struct Kinds {
-    smooth: bool,
-    painted: bool,
-    /// By distribution, GGX's first.
-    coat: [bool; 2],
-    metal: [bool; 2],
+/// A block for each kind of vertices that was met.
+#[derive(Clone, Debug)]
+pub(super) struct Blocks {
+    /// Of most vertices of most scenes.
+    pub(super) diffuse: Block,
+    others: [Option<Box<Block>>; Kind::ALL.len()],
+}
+
+impl Default for Blocks {
+    fn default() -> Blocks {
+        Blocks { diffuse: Block::new(Kind::Diffuse), others: Default::default() }
+    }
+}
+
+impl Blocks {
+    /// That of a kind.
+    #[inline(always)]
+    pub(super) fn of(&mut self, kind: Kind) -> &mut Block {
+        match kind {
+            Kind::Diffuse => &mut self.diffuse,
+            _ => self.others[kind.number()].get_or_insert_with(|| new(kind)),
+        }
+    }
+
+    /// Those that there are.
+    pub(super) fn all(&mut self) -> impl Iterator<Item = &mut Block> {
+        std::iter::once(&mut self.diffuse).chain(self.others.iter_mut().flatten().map(Box::as_mut))
+    }
+}
+
+#[cold]
+fn new(kind: Kind) -> Box<Block> {
+    Box::new(Block::new(kind))
 }
 
 /// Vertices by component. Lanes beyond `len`, and of vertices that pass through, hold what was there before: computed with, never read.
 #[derive(Clone, Debug)]
 pub(super) struct Block {
+    /// Of all its vertices.
+    kind: Kind,
     len: usize,
     index: [u32; N],
     key: [PathKey; N],
@@ -72,21 +99,19 @@ pub(super) struct Block {
     d: Lanes3,
     /// Albedo, also of a coat's base.
     reflectance: Lanes3,
-    kinds: Kinds,
     // of shading normals, where there are any
+    any_smooth: bool,
     is_smooth: [bool; N],
     n0: Lanes3,
     n1: Lanes3,
     n2: Lanes3,
     // of textures
+    any_painted: bool,
     is_painted: [bool; N],
     at: [At; N],
     spot: [Spot; N],
-    // of lobes, where there are any
-    is_coat: [bool; N],
-    is_metal: [bool; N],
-    is_beckmann: [bool; N],
     shape: [u32; N],
+    // of lobes
     alpha: Lanes,
     specular: Lanes3,
     eta: Lanes3,
@@ -115,6 +140,8 @@ pub(super) struct Block {
     unlit: u64,
     roulette: [bool; N],
     // of the light chosen
+    /// Whether any is a triangle.
+    any_triangle: bool,
     light_p0: Lanes3,
     light_e1: Lanes3,
     light_e2: Lanes3,
@@ -173,10 +200,12 @@ fn units(lanes: &mut Lanes, raw: &[u32; N]) {
     }
 }
 
-impl Default for Block {
-    fn default() -> Block {
+impl Block {
+    /// An empty one.
+    pub(super) fn new(kind: Kind) -> Block {
         let lanes = [0.0; N];
         Block {
+            kind,
             len: 0,
             index: [0; N],
             key: [PathKey { pixel: 0, sample: 0, branch: 0, vertex: 0 }; N],
@@ -190,17 +219,15 @@ impl Default for Block {
             v: lanes,
             d: Lanes3::ZERO,
             reflectance: Lanes3::ZERO,
-            kinds: Kinds::default(),
+            any_smooth: false,
             is_smooth: [false; N],
             n0: Lanes3::ZERO,
             n1: Lanes3::ZERO,
             n2: Lanes3::ZERO,
+            any_painted: false,
             is_painted: [false; N],
             at: [At::uv([0.0; 2]); N],
             spot: [Spot::default(); N],
-            is_coat: [false; N],
-            is_metal: [false; N],
-            is_beckmann: [false; N],
             shape: [0; N],
             alpha: lanes,
             specular: Lanes3::ZERO,
@@ -224,6 +251,7 @@ impl Default for Block {
             fewer: 0,
             unlit: 0,
             roulette: [false; N],
+            any_triangle: false,
             light_p0: Lanes3::ZERO,
             light_e1: Lanes3::ZERO,
             light_e2: Lanes3::ZERO,
@@ -266,7 +294,6 @@ impl Block {
         self.throughput.set(i, throughput);
         self.passes[i] = true;
         (self.is_smooth[i], self.is_painted[i]) = (false, false);
-        (self.is_coat[i], self.is_metal[i]) = (false, false);
         self.len += 1;
     }
 
@@ -300,7 +327,7 @@ impl Block {
     #[inline(always)]
     pub(super) fn set_normals(&mut self, [n0, n1, n2]: &[[f32; 3]; 3]) {
         let i = self.last();
-        (self.is_smooth[i], self.kinds.smooth) = (true, true);
+        (self.is_smooth[i], self.any_smooth) = (true, true);
         self.n0.set(i, Vec3::from(*n0));
         self.n1.set(i, Vec3::from(*n1));
         self.n2.set(i, Vec3::from(*n2));
@@ -324,7 +351,7 @@ impl Block {
     #[inline(always)]
     pub(super) fn set_place(&mut self, shape: u32, at: At, first: Spot) {
         let i = self.last();
-        (self.is_painted[i], self.kinds.painted) = (true, true);
+        (self.is_painted[i], self.any_painted) = (true, true);
         (self.shape[i], self.at[i], self.spot[i]) = (shape, at, first);
     }
 
@@ -341,7 +368,7 @@ impl Block {
         if few {
             self.passes = [true; N];
         } else {
-            if self.kinds.painted {
+            if self.any_painted {
                 self.paint(context);
             }
             wide::compute(self, context);
@@ -353,7 +380,7 @@ impl Block {
         } else {
             self.emit(out);
         }
-        (self.len, self.kinds) = (0, Kinds::default());
+        (self.len, self.any_smooth, self.any_painted) = (0, false, false);
     }
 
     /// Reads the textures.
@@ -374,10 +401,10 @@ impl Block {
     #[inline(always)]
     pub(super) fn phases(&mut self, context: &Context) {
         self.geometry();
-        self.lobes_enter(context);
+        self.enter(context);
         self.numbers(context);
         self.choose_lights(context);
-        self.sample_lights();
+        self.sample_triangles();
         self.other_lights(context);
         let skips_unlit = context.skips.makes(Skip::Shadows);
         self.shadow_rays(context, !skips_unlit);
@@ -397,7 +424,7 @@ impl Block {
             self.passes[i] |= !flat.sound;
         }
         self.shading = self.normal;
-        if self.kinds.smooth {
+        if self.any_smooth {
             for i in 0..N {
                 let (normal, d) = (self.normal.get(i), self.d.get(i));
                 let normals = [self.n0.get(i), self.n1.get(i), self.n2.get(i)];
@@ -444,21 +471,7 @@ impl Block {
             self.shadow_dir[i] = dir;
             self.shadow_d.set(i, d);
         }
-        for i in 0..N {
-            let contribution = towards_light(
-                self.throughput.get(i),
-                self.reflectance.get(i),
-                self.normal.get(i),
-                self.shading.get(i),
-                self.light_d.get(i),
-                self.shadow_d.get(i),
-                self.light_pdf[i],
-                self.arriving.get(i),
-                self.lit[i] & self.seen[i],
-            );
-            self.contribution.set(i, contribution);
-        }
-        self.lobes_towards_lights(context);
+        self.towards_lights(context);
         for i in 0..N {
             let contribution = self.contribution.get(i);
             let brings = (contribution.x != 0.0) | (contribution.y != 0.0) | (contribution.z != 0.0);
@@ -468,33 +481,13 @@ impl Block {
 
     #[inline(always)]
     fn next_rays(&mut self, context: &Context) {
-        for i in 0..N {
-            let (d, above) = cosine_direction(self.shading.get(i), [self.direction[0][i], self.direction[1][i]]);
-            self.next_d.set(i, d);
-            self.above[i] = above & self.seen[i];
-        }
-        self.lobes_directions();
+        self.directions();
         for i in 0..N {
             let (dir, d) = snap(self.next_d.get(i));
             self.next_dir[i] = dir;
             self.next_d.set(i, d);
         }
-        for i in 0..N {
-            let (throughput, pdf, fate) = onwards(
-                self.throughput.get(i),
-                self.reflectance.get(i),
-                self.normal.get(i),
-                self.shading.get(i),
-                self.next_d.get(i),
-                self.above[i],
-                self.go_on[i],
-                self.roulette[i],
-            );
-            self.next_throughput.set(i, throughput);
-            self.next_pdf[i] = pdf;
-            self.fate[i] = fate;
-        }
-        self.lobes_onwards(context);
+        self.onwards(context);
     }
 
     /// Counts the vertices without a shadow ray; those that pass are counted where they are shaded.
