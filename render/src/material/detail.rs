@@ -251,19 +251,7 @@ impl Bsdf {
     /// The number of a slot, where the model has it.
     pub fn number_mut(&mut self, slot: Slot) -> Option<&mut f32> {
         let Bsdf::Principled(p) = self else { return None };
-        Some(match slot {
-            Slot::Roughness => &mut p.roughness,
-            Slot::Anisotropic => &mut p.anisotropic,
-            Slot::Metallic => &mut p.metallic,
-            Slot::SpecTrans => &mut p.spec_trans,
-            Slot::SpecTint => &mut p.spec_tint,
-            Slot::Sheen => &mut p.sheen,
-            Slot::SheenTint => &mut p.sheen_tint,
-            Slot::Clearcoat => &mut p.clearcoat,
-            Slot::ClearcoatGloss => &mut p.clearcoat_gloss,
-            Slot::Flatness => &mut p.flatness,
-            _ => return None,
-        })
+        p.number_mut(slot)
     }
 
     /// The roughness, where a texture may give it.

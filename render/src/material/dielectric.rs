@@ -61,48 +61,56 @@ pub(super) struct RoughInterface {
     pub transmit: Vec3,
 }
 
+// selects, no branches: blocks of vertices are compiled from these
 impl RoughInterface {
+    #[inline(always)]
     pub(super) fn eval(&self, wo: Vec3, wi: Vec3) -> Scatter {
-        if !(wo.z > 0.0 && wi.z != 0.0) {
-            return Scatter::NONE;
-        }
         let reflects = wi.z > 0.0;
-        let m = if reflects { wo + wi } else { wo + wi * self.eta };
+        let m = wo + wi * if reflects { 1.0 } else { self.eta };
         let length = m.length();
         let m = m / if m.z < 0.0 { -length } else { length };
         let (cos_o, cos_i) = (wo.dot(m), wi.dot(m));
         // facets seen from the back neither reflect nor refract; nor do equal indices bend anything (length 0: NaN)
-        if !(length > 0.0 && cos_o > 0.0 && m.z > 0.0 && (cos_i > 0.0) == reflects) {
-            return Scatter::NONE;
-        }
+        let faces = (cos_o > 0.0) & (m.z > 0.0) & ((cos_i > 0.0) == reflects);
+        let counts = (wo.z > 0.0) & (wi.z != 0.0) & (length > 0.0) & faces;
         let (r, _) = fresnel(cos_o, self.eta);
         // density of the visible normals over their cosine to `wo`
         let visible = self.rough.density(m) * self.rough.masking(wo) / wo.z;
         let shadowing = self.rough.masking(wi);
-        if reflects {
-            let pdf = r * visible / 4.0;
-            return Scatter { value: self.reflect * (pdf * shadowing), pdf };
-        }
         let sum = cos_o + self.eta * cos_i;
         // Walter et al., equation 17
         let jacobian = self.eta * self.eta * -cos_i / (sum * sum);
-        let pdf = (1.0 - r) * visible * cos_o * jacobian;
-        if !(pdf > 0.0 && pdf.is_finite()) {
-            return Scatter::NONE;
-        }
-        Scatter { value: self.transmit * (pdf * shadowing / (self.eta * self.eta)), pdf }
+        let (reflected, bent) = (r * visible / 4.0, (1.0 - r) * visible * cos_o * jacobian);
+        let is_bent = (bent > 0.0) & (bent < f32::INFINITY);
+        let pick = |a: f32, b: f32| if reflects { a } else { b };
+        let pdf = pick(reflected, bent);
+        let share = pick(pdf * shadowing, pdf * shadowing / (self.eta * self.eta));
+        let color = Vec3::new(
+            pick(self.reflect.x, self.transmit.x),
+            pick(self.reflect.y, self.transmit.y),
+            pick(self.reflect.z, self.transmit.z),
+        );
+        Scatter { value: color * share, pdf }.only(counts & (reflects | is_bent))
     }
 
+    #[inline(always)]
     pub(super) fn sample(&self, wo: Vec3, u: [f32; 2], lobe: f32) -> Option<Sampled> {
-        let m = self.rough.visible_normal(wo, u)?;
+        let (wi, counts) = self.sample_or_not(wo, u, lobe);
+        counts.then(|| Sampled::smooth(wi))
+    }
+
+    /// The direction, and whether it is one.
+    #[inline(always)]
+    pub(super) fn sample_or_not(&self, wo: Vec3, u: [f32; 2], lobe: f32) -> (Vec3, bool) {
+        let (m, counts) = self.rough.visible_or_not(wo, u);
         let cos = wo.dot(m);
         let (r, cos_t) = fresnel(cos, self.eta);
-        if lobe < r {
-            let wi = m * (2.0 * cos) - wo;
-            return (wi.z > 0.0).then(|| Sampled::smooth(wi / wi.length()));
-        }
         let inv = 1.0 / self.eta;
-        let wi = m * (cos * inv - cos_t) - wo * inv;
-        (wi.z < 0.0 && cos_t > 0.0).then(|| Sampled::smooth(wi / wi.length()))
+        let (mirrored, bent) = (m * (2.0 * cos) - wo, m * (cos * inv - cos_t) - wo * inv);
+        let reflects = lobe < r;
+        let pick = |a: f32, b: f32| if reflects { a } else { b };
+        let wi = Vec3::new(pick(mirrored.x, bent.x), pick(mirrored.y, bent.y), pick(mirrored.z, bent.z));
+        let leaves = (reflects & (wi.z > 0.0)) | (!reflects & (wi.z < 0.0) & (cos_t > 0.0));
+        (wi / wi.length(), counts & leaves)
     }
 }

@@ -1,10 +1,11 @@
-//! Models as blocks of vertices take them: opaque ones whose lobe, if any, is isotropic; parameters by value, functions without
+//! Models as blocks of vertices take them: those whose lobe, if any, is isotropic; parameters by value, functions without
 //! branches. They are the same inlined code as [`Bsdf::eval`] and [`Bsdf::sample`], so the bits are the same.
 
 use super::detail::{Textured, scaled, share};
+use super::dielectric::RoughInterface;
 use super::plastic::Coated;
 use super::rough::Rough;
-use super::{Bsdf, Detail, Distribution, Material, Scatter, Slot, Transmittance, conductor, diffuse};
+use super::{Bsdf, Detail, Distribution, Material, Principled, Scatter, Slot, Transmittance, conductor, diffuse};
 use crate::real::{Vec3, f32};
 use crate::texture::{At, Spot, Texture, Textures};
 
@@ -17,6 +18,10 @@ pub(crate) enum Look {
     Coat(Coat),
     /// Rough metal.
     Metal(Metal),
+    /// A rough interface of glass.
+    Glass(Glass),
+    /// The model of many parameters.
+    Principled(Principled),
 }
 
 /// [`Bsdf::RoughPlastic`].
@@ -51,16 +56,24 @@ pub(crate) enum Kind {
     Coat(Distribution),
     /// [`Look::Metal`].
     Metal(Distribution),
+    /// [`Look::Glass`].
+    Glass(Distribution),
+    /// [`Look::Principled`]; whether light passes through.
+    Principled { through: bool },
 }
 
 impl Kind {
     /// Every kind.
-    pub(crate) const ALL: [Kind; 5] = [
+    pub(crate) const ALL: [Kind; 9] = [
         Kind::Diffuse,
         Kind::Coat(Distribution::Ggx),
         Kind::Coat(Distribution::Beckmann),
         Kind::Metal(Distribution::Ggx),
         Kind::Metal(Distribution::Beckmann),
+        Kind::Glass(Distribution::Ggx),
+        Kind::Glass(Distribution::Beckmann),
+        Kind::Principled { through: false },
+        Kind::Principled { through: true },
     ];
 
     /// Its place among all.
@@ -70,8 +83,33 @@ impl Kind {
             Kind::Diffuse => 0,
             Kind::Coat(distribution) => 1 + usize::from(distribution == Distribution::Beckmann),
             Kind::Metal(distribution) => 3 + usize::from(distribution == Distribution::Beckmann),
+            Kind::Glass(distribution) => 5 + usize::from(distribution == Distribution::Beckmann),
+            Kind::Principled { through } => 7 + usize::from(through),
         }
     }
+
+    /// Whether light passes through.
+    #[inline(always)]
+    pub(crate) fn transmits(self) -> bool {
+        matches!(self, Kind::Glass(_) | Kind::Principled { through: true })
+    }
+
+    /// Whether it matters from which side the surface is seen.
+    #[inline(always)]
+    pub(crate) fn has_sides(self) -> bool {
+        matches!(self, Kind::Glass(_) | Kind::Principled { .. })
+    }
+}
+
+/// [`Bsdf::RoughDielectric`].
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Glass {
+    pub distribution: Distribution,
+    pub alpha: f32,
+    /// Index inside over outside; in a block that beyond the surface over that on this side.
+    pub eta: f32,
+    pub reflect: [f32; 3],
+    pub transmit: [f32; 3],
 }
 
 impl Material {
@@ -82,12 +120,16 @@ impl Material {
             Bsdf::Diffuse { .. } => Kind::Diffuse,
             Bsdf::RoughPlastic { distribution, .. } => Kind::Coat(*distribution),
             Bsdf::RoughConductor { distribution, alpha, .. } if alpha[0] == alpha[1] => Kind::Metal(*distribution),
+            Bsdf::RoughDielectric { distribution, alpha, .. } if alpha[0] == alpha[1] => Kind::Glass(*distribution),
+            Bsdf::Principled(p) if p.anisotropic == 0.0 => Kind::Principled { through: self.bsdf.transmits() },
             _ => return None,
         };
-        let is_paint = |detail: &Detail| {
-            let turns = |t: &Textured| matches!(t.slot, Slot::AlphaU | Slot::AlphaV);
-            detail.is_paint() && !detail.textured.iter().any(turns)
+        // what makes a lobe anisotropic, or another kind of it
+        let changes = |t: &Textured| match kind {
+            Kind::Principled { .. } => matches!(t.slot, Slot::Anisotropic | Slot::Metallic | Slot::SpecTrans),
+            _ => matches!(t.slot, Slot::AlphaU | Slot::AlphaV),
         };
+        let is_paint = |detail: &Detail| detail.is_paint() && !detail.textured.iter().any(changes);
         self.detail.as_deref().is_none_or(is_paint).then_some(kind)
     }
 
@@ -108,6 +150,14 @@ impl Material {
             Bsdf::RoughConductor { distribution, alpha: [alpha, _], eta, k, specular } => {
                 Look::Metal(Metal { distribution: *distribution, alpha: *alpha, eta: *eta, k: *k, specular: *specular })
             }
+            Bsdf::RoughDielectric { distribution, alpha: [alpha, _], eta, reflect, transmit } => Look::Glass(Glass {
+                distribution: *distribution,
+                alpha: *alpha,
+                eta: *eta,
+                reflect: *reflect,
+                transmit: *transmit,
+            }),
+            Bsdf::Principled(p) => Look::Principled(*p),
             _ => return None,
         })
     }
@@ -120,15 +170,30 @@ impl Material {
         for (k, &Textured { slot, texture, scale }) in detail.textured.iter().enumerate() {
             let texture = &textures[texture as usize];
             match (slot, &mut look) {
-                (Slot::Diffuse, Look::Diffuse(color) | Look::Coat(Coat { diffuse: color, .. }))
+                (
+                    Slot::Diffuse,
+                    Look::Diffuse(color)
+                    | Look::Coat(Coat { diffuse: color, .. })
+                    | Look::Principled(Principled { base_color: color, .. }),
+                )
                 | (
                     Slot::Specular,
-                    Look::Coat(Coat { specular: color, .. }) | Look::Metal(Metal { specular: color, .. }),
-                ) => {
+                    Look::Coat(Coat { specular: color, .. })
+                    | Look::Metal(Metal { specular: color, .. })
+                    | Look::Glass(Glass { reflect: color, .. }),
+                )
+                | (Slot::Transmit, Look::Glass(Glass { transmit: color, .. })) => {
                     let spot = if k == 0 { *first } else { texture.spot(at) };
                     *color = scaled(texture.color_at(tiles, at, &spot), scale);
                 }
-                (Slot::Alpha, Look::Metal(metal)) => metal.alpha = share(texture.amount(tiles, at) * scale[0]),
+                (Slot::Alpha, Look::Metal(Metal { alpha, .. }) | Look::Glass(Glass { alpha, .. })) => {
+                    *alpha = share(texture.amount(tiles, at) * scale[0]);
+                }
+                (slot, Look::Principled(p)) => {
+                    if let Some(number) = p.number_mut(slot) {
+                        *number = share(texture.amount(tiles, at) * scale[0]);
+                    }
+                }
                 // of no meaning for this model, as in `Material::at`
                 _ => {}
             }
@@ -197,5 +262,29 @@ impl Metal {
     #[inline(always)]
     fn rough(&self) -> Rough {
         Rough::new(self.distribution, [self.alpha, self.alpha])
+    }
+}
+
+impl Glass {
+    /// Value and density; `eta` is that beyond the surface over that on the side of `wo`.
+    #[inline(always)]
+    pub(crate) fn eval(&self, wo: Vec3, wi: Vec3) -> Scatter {
+        self.interface().eval(wo, wi)
+    }
+
+    /// A direction, and whether it is one.
+    #[inline(always)]
+    pub(crate) fn sample(&self, wo: Vec3, u: [f32; 2], lobe: f32) -> (Vec3, bool) {
+        self.interface().sample_or_not(wo, u, lobe)
+    }
+
+    #[inline(always)]
+    fn interface(&self) -> RoughInterface {
+        RoughInterface {
+            rough: Rough::new(self.distribution, [self.alpha, self.alpha]),
+            eta: self.eta,
+            reflect: Vec3::new(self.reflect[0], self.reflect[1], self.reflect[2]),
+            transmit: Vec3::new(self.transmit[0], self.transmit[1], self.transmit[2]),
+        }
     }
 }

@@ -23,7 +23,7 @@ mod tests;
 use serde::{Deserialize, Serialize};
 
 pub use detail::{Amount, Blend, Detail, Relief, ReliefKind, Slot, Textured};
-pub(crate) use gloss::{Coat, Kind, Look, Metal};
+pub(crate) use gloss::{Coat, Glass, Kind, Look, Metal};
 pub use plastic::Transmittance;
 pub use principled::Principled;
 
@@ -339,6 +339,6 @@ impl Bsdf {
 
 /// Index beyond the surface over the index on this side.
 #[inline(always)]
-fn relative(eta: f32, front: bool) -> f32 {
+pub(crate) fn relative(eta: f32, front: bool) -> f32 {
     if front { eta } else { 1.0 / eta }
 }

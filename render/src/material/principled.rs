@@ -8,10 +8,10 @@ use serde::{Deserialize, Serialize};
 
 use super::dielectric::fresnel;
 use super::rough::Rough;
-use super::{Distribution, Sampled, Scatter, diffuse, relative};
-use crate::math::{luminance, sincos_turn};
+use super::{Distribution, Sampled, Scatter, Slot, diffuse, relative};
+use crate::math::{exp_down, ln, luminance, select, sincos_turn};
 use crate::real::consts::{FRAC_1_PI, PI};
-use crate::real::{Vec3, expm1, f32, log};
+use crate::real::{Vec3, f32};
 
 /// Parameters, in [0, 1] unless said.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
@@ -57,190 +57,199 @@ struct Lobes {
 
 impl Principled {
     /// Roughness along u and v.
+    #[inline(always)]
     pub(super) fn alpha(&self) -> [f32; 2] {
         let square = self.roughness * self.roughness;
         let aspect = (1.0 - 0.9 * self.anisotropic).sqrt();
         [(square / aspect).max(0.001), (square * aspect).max(0.001)]
     }
 
+    #[inline(always)]
     fn rough(&self) -> Rough {
         Rough::new(Distribution::Ggx, self.alpha())
     }
 
     /// Share of the base.
+    #[inline(always)]
     fn base(&self) -> f32 {
         (1.0 - self.metallic) * (1.0 - self.spec_trans)
     }
 
     /// Share that lets light through.
-    fn through(&self) -> f32 {
+    #[inline(always)]
+    pub(super) fn through(&self) -> f32 {
         (1.0 - self.metallic) * self.spec_trans
     }
 
+    #[inline(always)]
     fn lobes(&self, front: bool, r: f32) -> Lobes {
         let through = self.through();
-        if !front {
-            return Lobes { reflect: r, transmit: 1.0 - r, coat: 0.0, base: 0.0 };
-        }
         let (coat, base) = (0.25 * self.clearcoat, self.base());
         let inv = 1.0 / (1.0 + coat + base);
         let transmit = through * (1.0 - r);
-        Lobes { reflect: (1.0 - transmit) * inv, transmit: transmit * inv, coat: coat * inv, base: base * inv }
+        let pick = |a: f32, b: f32| if front { a } else { b };
+        Lobes {
+            reflect: pick((1.0 - transmit) * inv, r),
+            transmit: pick(transmit * inv, 1.0 - r),
+            coat: pick(coat * inv, 0.0),
+            base: pick(base * inv, 0.0),
+        }
     }
 
+    #[inline(always)]
     fn coat(&self) -> Gtr1 {
         Gtr1::new(0.1 + (0.001 - 0.1) * self.clearcoat_gloss)
     }
 
     /// The base colour over its luminance.
+    #[inline(always)]
     fn hue(&self) -> Vec3 {
-        let color = Vec3::from(self.base_color);
+        let color = self.color();
         let light = luminance(color);
-        if light > 0.0 { color / light } else { Vec3::ONE }
+        select(light > 0.0, color / light, Vec3::ONE)
+    }
+
+    #[inline(always)]
+    fn color(&self) -> Vec3 {
+        Vec3::new(self.base_color[0], self.base_color[1], self.base_color[2])
     }
 
     /// What the main lobe reflects at a cosine at which a dielectric reflects the share `r`.
+    #[inline(always)]
     fn reflectance(&self, front: bool, cos: f32, r: f32) -> Vec3 {
-        if !front {
-            return Vec3::splat(self.through() * r);
-        }
         let weight = self.schlick_weight(cos);
         let schlick = |straight: Vec3| straight + (Vec3::ONE - straight) * weight;
-        let mut out = Vec3::splat((1.0 - self.metallic) * (1.0 - self.spec_tint) * r);
-        if self.metallic > 0.0 {
-            out += schlick(self.base_color.into()) * self.metallic;
-        }
-        if self.spec_tint > 0.0 {
-            let root = (self.eta - 1.0) / (self.eta + 1.0);
-            out += schlick(self.hue() * (root * root)) * ((1.0 - self.metallic) * self.spec_tint);
-        }
-        out
+        let root = (self.eta - 1.0) / (self.eta + 1.0);
+        let clear = Vec3::splat((1.0 - self.metallic) * (1.0 - self.spec_tint) * r);
+        let metal = schlick(self.color()) * self.metallic;
+        let tinted = schlick(self.hue() * (root * root)) * ((1.0 - self.metallic) * self.spec_tint);
+        select(front, clear + metal + tinted, Vec3::splat(self.through() * r))
     }
 
     /// Schlick's (1 - cos)^5, by the cosine in the thinner medium.
+    #[inline(always)]
     fn schlick_weight(&self, cos: f32) -> f32 {
-        if self.eta > 1.0 {
-            return fifth(cos);
-        }
         let inv = 1.0 / self.eta;
-        fifth((1.0 - (1.0 - cos * cos) * (inv * inv)).max(0.0).sqrt())
+        let thinner = (1.0 - (1.0 - cos * cos) * (inv * inv)).max(0.0).sqrt();
+        fifth(if self.eta > 1.0 { cos } else { thinner })
     }
 
-    pub(super) fn eval(&self, wo: Vec3, wi: Vec3, front: bool) -> Scatter {
+    // selects, no branches: blocks of vertices are compiled from these
+    #[inline(always)]
+    pub(crate) fn eval(&self, wo: Vec3, wi: Vec3, front: bool) -> Scatter {
         let through = self.through();
-        if !(wo.z > 0.0 && wi.z != 0.0) || (!front && !(through > 0.0)) {
-            return Scatter::NONE;
-        }
         let eta = relative(self.eta, front);
         let reflects = wi.z > 0.0;
-        if !reflects && !(through > 0.0) {
-            return Scatter::NONE;
-        }
-        let m = if reflects { wo + wi } else { wo + wi * eta };
+        let m = wo + wi * if reflects { 1.0 } else { eta };
         let length = m.length();
         let m = m / if m.z < 0.0 { -length } else { length };
         let (cos_o, cos_i) = (wo.dot(m), wi.dot(m));
         // facets are seen from the front; equal indices bend nothing (length 0)
-        let facets = length > 0.0 && cos_o > 0.0 && m.z > 0.0 && (cos_i > 0.0) == reflects;
-        let (mut value, mut pdf) = (Vec3::ZERO, 0.0);
+        let facets = (length > 0.0) & (cos_o > 0.0) & (m.z > 0.0) & ((cos_i > 0.0) == reflects);
         let r = if facets { fresnel(cos_o, eta).0 } else { 0.0 };
         let lobes = self.lobes(front, r);
-        if facets {
-            let rough = self.rough();
-            // density of the visible normals over their cosine to `wo`
-            let visible = rough.density(m) * rough.masking(wo) / wo.z;
-            let shadowing = rough.masking(wi);
-            if reflects {
-                // as in Mitsuba, a surface without Fresnel reflection has none of a metal either
-                if r > 0.0 {
-                    value += self.reflectance(front, cos_o, r) * (visible * shadowing / 4.0);
-                }
-                pdf += lobes.reflect * visible / 4.0;
-            } else {
-                let sum = cos_o + eta * cos_i;
-                let jacobian = visible * cos_o * -cos_i / (sum * sum);
-                let color = Vec3::from(self.base_color.map(f32::sqrt));
-                value += color * (through * (1.0 - r) * jacobian * shadowing);
-                pdf += lobes.transmit * jacobian * (eta * eta);
-            }
-            if reflects && front && self.clearcoat > 0.0 {
-                let coat = self.coat();
-                let density = coat.density(m);
-                let masking = Rough::new(Distribution::Ggx, [COAT_MASKING; 2]);
-                let share = COAT_STRAIGHT + (1.0 - COAT_STRAIGHT) * self.schlick_weight(cos_o);
-                let shadowing = masking.masking(wo) * masking.masking(wi);
-                value += Vec3::splat(0.25 * self.clearcoat * share * density * shadowing * wi.z);
-                pdf += lobes.coat * density * m.z / (4.0 * cos_i);
-            }
-        }
-        if reflects && front {
-            value += self.base_value(wo, wi, cos_i);
-            pdf += lobes.base * wi.z * FRAC_1_PI;
-        }
-        if !(pdf > 0.0 && pdf.is_finite() && value.is_finite()) {
-            return Scatter::NONE;
-        }
-        Scatter { value, pdf }
+        let rough = self.rough();
+        // density of the visible normals over their cosine to `wo`
+        let visible = rough.density(m) * rough.masking(wo) / wo.z;
+        let shadowing = rough.masking(wi);
+        // as in Mitsuba, a surface without Fresnel reflection has none of a metal either
+        let reflected = self.reflectance(front, cos_o, r) * (visible * shadowing / 4.0);
+        let reflected = select(r > 0.0, reflected, Vec3::ZERO);
+        let sum = cos_o + eta * cos_i;
+        let jacobian = visible * cos_o * -cos_i / (sum * sum);
+        let root = Vec3::new(self.base_color[0].sqrt(), self.base_color[1].sqrt(), self.base_color[2].sqrt());
+        let bent = root * (through * (1.0 - r) * jacobian * shadowing);
+        let main = select(reflects, reflected, bent);
+        let main_pdf = if reflects { lobes.reflect * visible / 4.0 } else { lobes.transmit * jacobian * (eta * eta) };
+
+        let coat = self.coat();
+        let density = coat.density(m);
+        let masking = Rough::new(Distribution::Ggx, [COAT_MASKING, COAT_MASKING]);
+        let share = COAT_STRAIGHT + (1.0 - COAT_STRAIGHT) * self.schlick_weight(cos_o);
+        let masked = masking.masking(wo) * masking.masking(wi);
+        let coated = 0.25 * self.clearcoat * share * density * masked * wi.z;
+        let coat_pdf = lobes.coat * density * m.z / (4.0 * cos_i);
+
+        let above = reflects & front;
+        let is_coated = facets & above & (self.clearcoat > 0.0);
+        let value = select(facets, main, Vec3::ZERO)
+            + Vec3::splat(if is_coated { coated } else { 0.0 })
+            + select(above, self.base_value(wo, wi, cos_i), Vec3::ZERO);
+        let pdf = if facets { main_pdf } else { 0.0 }
+            + if is_coated { coat_pdf } else { 0.0 }
+            + if above { lobes.base * wi.z * FRAC_1_PI } else { 0.0 };
+        let finite = |x: f32| x.abs() < f32::INFINITY;
+        let passes = (front & reflects) | (through > 0.0);
+        let counts = (wo.z > 0.0) & (wi.z != 0.0) & passes & (pdf > 0.0) & finite(pdf);
+        Scatter { value, pdf }.only(counts & finite(value.x) & finite(value.y) & finite(value.z))
     }
 
     /// Base and sheen times the cosine; `cos_d` is that between a direction and the normal half way.
+    #[inline(always)]
     fn base_value(&self, wo: Vec3, wi: Vec3, cos_d: f32) -> Vec3 {
-        let mut value = Vec3::ZERO;
-        let share = self.base();
-        if share > 0.0 {
-            let (out, into) = (fifth(wi.z), fifth(wo.z));
-            let smooth = (1.0 - 0.5 * into) * (1.0 - 0.5 * out);
-            let retro = 2.0 * self.roughness * cos_d * cos_d;
-            let back = retro * (out + into + out * into * (retro - 1.0));
-            let mut shape = smooth + back;
-            if self.flatness > 0.0 {
-                let grazing = 0.5 * retro;
-                let fade = |w: f32| 1.0 + (grazing - 1.0) * w;
-                let flat = 1.25 * (fade(out) * fade(into) * (1.0 / (wi.z + wo.z) - 0.5) + 0.5);
-                shape += (flat - shape) * self.flatness;
-            }
-            value += Vec3::from(self.base_color) * (share * shape * FRAC_1_PI);
-        }
-        if self.sheen > 0.0 {
-            let tint = Vec3::ONE + (self.hue() - Vec3::ONE) * self.sheen_tint;
-            value += tint * (self.sheen * (1.0 - self.metallic) * fifth(cos_d));
-        }
-        value * wi.z
+        let (out, into) = (fifth(wi.z), fifth(wo.z));
+        let smooth = (1.0 - 0.5 * into) * (1.0 - 0.5 * out);
+        let retro = 2.0 * self.roughness * cos_d * cos_d;
+        let back = retro * (out + into + out * into * (retro - 1.0));
+        let grazing = 0.5 * retro;
+        let fade = |w: f32| 1.0 + (grazing - 1.0) * w;
+        let flat = 1.25 * (fade(out) * fade(into) * (1.0 / (wi.z + wo.z) - 0.5) + 0.5);
+        let shape = smooth + back;
+        let shape = shape + (flat - shape) * self.flatness;
+        let base = self.color() * (self.base() * shape * FRAC_1_PI);
+        let tint = Vec3::ONE + (self.hue() - Vec3::ONE) * self.sheen_tint;
+        (base + tint * (self.sheen * (1.0 - self.metallic) * fifth(cos_d))) * wi.z
     }
 
+    #[inline(always)]
     pub(super) fn sample(&self, wo: Vec3, front: bool, u: [f32; 2], lobe: f32) -> Option<Sampled> {
-        if !(wo.z > 0.0) || (!front && !(self.through() > 0.0)) {
-            return None;
-        }
+        let (wi, counts) = self.sample_or_not(wo, front, u, lobe);
+        counts.then(|| Sampled::smooth(wi))
+    }
+
+    /// A direction, and whether it is one.
+    #[inline(always)]
+    pub(crate) fn sample_or_not(&self, wo: Vec3, front: bool, u: [f32; 2], lobe: f32) -> (Vec3, bool) {
         // base and coat do not depend on the normal
         let Lobes { base, coat, .. } = self.lobes(front, 0.0);
-        if lobe < base {
-            return diffuse::sample(wo, u).map(Sampled::smooth);
-        }
-        if lobe < base + coat {
-            let m = self.coat().sample(u);
-            return mirrored(wo, m);
-        }
-        let m = self.rough().visible_normal(wo, u)?;
+        let is_base = lobe < base;
+        let is_coat = !is_base & (lobe < base + coat);
+        let (of_base, is_one) = diffuse::sample_or_not(u);
+        let (visible, is_normal) = self.rough().visible_or_not(wo, u);
+        let m = select(is_coat, self.coat().sample(u), visible);
         let cos = wo.dot(m);
         let eta = relative(self.eta, front);
         let (r, cos_t) = fresnel(cos, eta);
-        if lobe < base + coat + self.lobes(front, r).transmit {
-            let inv = 1.0 / eta;
-            let wi = m * (cos * inv - cos_t) - wo * inv;
-            return (wi.z < 0.0 && cos_t > 0.0).then(|| Sampled::smooth(wi / wi.length()));
-        }
-        mirrored(wo, m)
+        let is_bent = !is_base & !is_coat & (lobe < base + coat + self.lobes(front, r).transmit);
+        let inv = 1.0 / eta;
+        let (mirrored, bent) = (m * (2.0 * cos) - wo, m * (cos * inv - cos_t) - wo * inv);
+        let wi = select(is_bent, bent, mirrored);
+        let passes = (is_bent & (wi.z < 0.0) & (cos_t > 0.0)) | (!is_bent & (cos > 0.0) & (wi.z > 0.0));
+        let of_facet = passes & (is_coat | is_normal);
+        let counts = (wo.z > 0.0) & (front | (self.through() > 0.0)) & ((is_base & is_one) | (!is_base & of_facet));
+        (select(is_base, of_base, wi / wi.length()), counts)
+    }
+
+    /// The number of a slot, where the model has it.
+    pub(super) fn number_mut(&mut self, slot: Slot) -> Option<&mut f32> {
+        Some(match slot {
+            Slot::Roughness => &mut self.roughness,
+            Slot::Anisotropic => &mut self.anisotropic,
+            Slot::Metallic => &mut self.metallic,
+            Slot::SpecTrans => &mut self.spec_trans,
+            Slot::SpecTint => &mut self.spec_tint,
+            Slot::Sheen => &mut self.sheen,
+            Slot::SheenTint => &mut self.sheen_tint,
+            Slot::Clearcoat => &mut self.clearcoat,
+            Slot::ClearcoatGloss => &mut self.clearcoat_gloss,
+            Slot::Flatness => &mut self.flatness,
+            _ => return None,
+        })
     }
 }
 
-fn mirrored(wo: Vec3, m: Vec3) -> Option<Sampled> {
-    let cos = wo.dot(m);
-    let wi = m * (2.0 * cos) - wo;
-    (cos > 0.0 && wi.z > 0.0).then(|| Sampled::smooth(wi / wi.length()))
-}
-
 /// (1 - cos)^5.
+#[inline(always)]
 fn fifth(cos: f32) -> f32 {
     let m = (1.0 - cos.abs()).clamp(0.0, 1.0);
     let m2 = m * m;
@@ -254,11 +263,13 @@ struct Gtr1 {
 }
 
 impl Gtr1 {
+    #[inline(always)]
     fn new(alpha: f32) -> Gtr1 {
         let alpha2 = alpha * alpha;
-        Gtr1 { alpha2, log: log(alpha2) }
+        Gtr1 { alpha2, log: ln(alpha2) }
     }
 
+    #[inline(always)]
     fn density(&self, m: Vec3) -> f32 {
         // 1 + (alpha^2 - 1) cos^2 without cancellation
         let t = m.x * m.x + m.y * m.y + self.alpha2 * (m.z * m.z);
@@ -266,9 +277,10 @@ impl Gtr1 {
     }
 
     /// A normal of density `density(m) m.z` in solid angle.
+    #[inline(always)]
     fn sample(&self, u: [f32; 2]) -> Vec3 {
-        // sin^2 = (alpha^2(1 - u) - alpha^2) / (1 - alpha^2)
-        let sin2 = (self.alpha2 * expm1(-u[1] * self.log) / (1.0 - self.alpha2)).clamp(0.0, 1.0);
+        // the square of the sine is (alpha^2(1 - u) - alpha^2) / (1 - alpha^2): its error is a rounding of alpha^2, which is what it is like where it is least
+        let sin2 = ((exp_down((1.0 - u[1]) * self.log) - self.alpha2) / (1.0 - self.alpha2)).clamp(0.0, 1.0);
         let (s, c) = sincos_turn(u[0]);
         let sin = sin2.sqrt();
         Vec3::new(sin * c, sin * s, (1.0 - sin2).sqrt())

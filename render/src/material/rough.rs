@@ -87,7 +87,7 @@ impl Rough {
 
     /// The normal, and whether it is one.
     #[inline(always)]
-    fn visible_or_not(&self, wo: Vec3, u: [f32; 2]) -> (Vec3, bool) {
+    pub(super) fn visible_or_not(&self, wo: Vec3, u: [f32; 2]) -> (Vec3, bool) {
         // to the configuration of roughness 1
         let w = Vec3::new(self.ax * wo.x, self.ay * wo.y, wo.z);
         let w = w / w.length();

@@ -18,7 +18,15 @@ pub use frame::Basis;
 pub use offset::{Position, gamma, offset_origin};
 pub use trig::{atan2, concentric_disk, sincos_turn};
 
+/// `a` where `yes`, else `b`: no branch.
+#[inline(always)]
+pub(crate) fn select(yes: bool, a: Vec3, b: Vec3) -> Vec3 {
+    let pick = |a: f32, b: f32| if yes { a } else { b };
+    Vec3::new(pick(a.x, b.x), pick(a.y, b.y), pick(a.z, b.z))
+}
+
 /// Luminance of linear Rec. 709.
+#[inline(always)]
 pub fn luminance(c: Vec3) -> f32 {
     0.2126 * c.x + 0.7152 * c.y + 0.0722 * c.z
 }

@@ -1,9 +1,8 @@
 //! What a hit looks like from the side it was hit from.
 
 use super::Surface;
-use super::vertex::select;
 use crate::material::Relief;
-use crate::math::{Basis, Position, gamma, offset_origin};
+use crate::math::{Basis, Position, gamma, offset_origin, select};
 use crate::ray::Hit;
 use crate::real::consts::PI;
 use crate::real::{Vec3, f32, narrow, wide};

@@ -63,16 +63,30 @@ pub fn shade_traced<S: Surfaces>(
             }
             continue;
         }
-        let Some(leaving) = arrive(context, surfaces, index, ray, hit, out) else { continue };
-        for child in 0..leaving.children {
+        let Some(Leaving { shape, material, children, throughput }) = arrive(context, surfaces, index, ray, hit, out)
+        else {
+            continue;
+        };
+        for child in 0..children {
             let key = PathKey { branch: ray.key.branch + child as u16, ..ray.key };
+            let at = (index, hit, traced.d);
             // where nothing is to be skipped by way of `scatter_plain`, which looks for detail
-            let block =
-                if bares { enter(context, surfaces, index, hit, traced.d, key, leaving, &mut blocks) } else { None };
-            match block {
-                None => one_by_one(context, surfaces, rays, hits, index, key, leaving.throughput, out),
-                Some(block) if block.is_full() => flush(context, surfaces, rays, hits, block, out),
-                Some(_) => {}
+            if bares && let Some(flat) = flat_and_diffuse(surfaces, index, hit, material) {
+                let block = &mut blocks.diffuse;
+                block.push(index as u32, key, throughput);
+                block.set_triangle(&flat.0, hit, traced.d, material.two_sided);
+                block.set_albedo(flat.1);
+                if block.is_full() {
+                    flush(context, surfaces, rays, hits, block, out);
+                }
+            } else if bares
+                && let Some(block) = enter(context, surfaces, at, key, (shape, material, throughput), &mut blocks)
+            {
+                if block.is_full() {
+                    flush(context, surfaces, rays, hits, block, out);
+                }
+            } else {
+                one_by_one(context, surfaces, rays, hits, index, key, throughput, out);
             }
         }
     }
@@ -187,7 +201,6 @@ fn emit(ray: &PathRay, radiance: Vec3, light_pdf: f32, out: &mut Outcome) {
 }
 
 /// What leaves from a hit.
-#[derive(Clone, Copy)]
 struct Leaving<'a> {
     /// Of this shape.
     shape: u32,
@@ -199,48 +212,35 @@ struct Leaving<'a> {
 }
 
 #[cfg(not(feature = "double"))]
-/// Puts a vertex into the block of its kind, if there is one: written where it is to stay, as copies of what was just written wait for it.
+/// The vertices and the albedo of a triangle without anything else: most hits of most scenes.
 #[inline(always)]
-fn enter<'b, S: Surfaces>(
-    context: &Context,
+fn flat_and_diffuse<S: Surfaces>(
     surfaces: &S,
     index: usize,
     hit: &Hit,
-    d: [f32; 3],
-    key: PathKey,
-    leaving: Leaving,
-    blocks: &'b mut Blocks,
-) -> Option<&'b mut Block> {
-    // most hits of most scenes
-    let material = leaving.material;
-    if let (Bsdf::Diffuse { reflectance }, None) = (&material.bsdf, &material.detail)
-        && let Surface { geometry: Primitive::Triangle(vertices), normals: None, .. } = surfaces.surface(index, hit)
-    {
-        let block = &mut blocks.diffuse;
-        block.push(index as u32, key, leaving.throughput);
-        block.set_triangle(&vertices, hit, d, material.two_sided);
-        block.set_albedo(*reflectance);
-        return Some(block);
+    material: &Material,
+) -> Option<([[f32; 3]; 3], [f32; 3])> {
+    let (Bsdf::Diffuse { reflectance }, None) = (&material.bsdf, &material.detail) else { return None };
+    match surfaces.surface(index, hit) {
+        Surface { geometry: Primitive::Triangle(vertices), normals: None, .. } => Some((vertices, *reflectance)),
+        _ => None,
     }
-    let block = blocks.of(material.kind()?);
-    enter_with_look(context, surfaces, index, hit, d, key, leaving, block).then_some(block)
 }
 
 #[cfg(not(feature = "double"))]
-/// The same of every look, with shading normals and textures; whether the block takes it.
+/// Puts a vertex into the block of its kind, with shading normals and textures, if there is a block that takes it.
 #[inline(never)]
-fn enter_with_look<S: Surfaces>(
+fn enter<'b, S: Surfaces>(
     context: &Context,
     surfaces: &S,
-    index: usize,
-    hit: &Hit,
-    d: [f32; 3],
+    (index, hit, d): (usize, &Hit, [f32; 3]),
     key: PathKey,
-    Leaving { shape, material, throughput, .. }: Leaving,
-    block: &mut Block,
-) -> bool {
+    (shape, material, throughput): (u32, &Material, Vec3),
+    blocks: &'b mut Blocks,
+) -> Option<&'b mut Block> {
+    let block = blocks.of(material.kind()?);
     let surface = surfaces.surface(index, hit);
-    let Primitive::Triangle(vertices) = &surface.geometry else { return false };
+    let Primitive::Triangle(vertices) = &surface.geometry else { return None };
     match &material.detail {
         Some(detail) if !detail.textured.is_empty() => {
             let place = triangle_place(&surface, hit);
@@ -255,16 +255,17 @@ fn enter_with_look<S: Surfaces>(
             block.set_place(shape, place, first.unwrap_or_default());
         }
         _ => {
-            let Some(look) = material.even_look() else { return false };
+            let look = material.even_look()?;
             block.push(index as u32, key, throughput);
             block.set_look(shape, &look);
         }
     }
+    // written where it is to stay: copies of what was just written wait for it
     block.set_triangle(vertices, hit, d, material.two_sided);
     if let Some(normals) = &surface.normals {
         block.set_normals(normals);
     }
-    true
+    Some(block)
 }
 
 /// Emission, depth and splitting; `None` when the path ends here.

@@ -2,7 +2,7 @@
 
 use super::power_heuristic;
 use crate::material::Scatter;
-use crate::math::{Basis, UnitDir, concentric_disk};
+use crate::math::{Basis, UnitDir, concentric_disk, select};
 use crate::real::consts::FRAC_1_PI;
 use crate::real::{Vec3, f32};
 
@@ -16,13 +16,6 @@ pub(super) enum Fate {
     Absorbed,
     /// Russian roulette ended it.
     Roulette,
-}
-
-/// `a` where `yes`, else `b`.
-#[inline(always)]
-pub(super) fn select(yes: bool, a: Vec3, b: Vec3) -> Vec3 {
-    let pick = |a: f32, b: f32| if yes { a } else { b };
-    Vec3::new(pick(a.x, b.x), pick(a.y, b.y), pick(a.z, b.z))
 }
 
 /// A direction as it travels: its code, and what that stands for.

@@ -1,15 +1,54 @@
 //! Choosing lights and points on them.
 
-use super::{Block, N, set, set3};
+use super::lanes::{Lanes, set, set3};
+use super::{Block, N};
 use crate::light::{
-    Facing, Few, FewLight, FewShape, LightSample, Node, SphereLight, TriangleLight, at_least, end, probability,
+    Few, FewLight, FewShape, LightSample, Node, SphereLight, TriangleLight, at_least, end, probability,
 };
+use crate::math::select;
 use crate::path::Context;
-use crate::path::vertex::select;
 
 impl Block {
+    /// Chooses them and points on them.
     #[inline(always)]
-    pub(super) fn choose_lights(&mut self, context: &Context) {
+    pub(super) fn lights(&mut self, context: &Context) {
+        self.choose_lights(context);
+        self.sample_triangles();
+        self.other_lights(context);
+    }
+
+    /// Those that lie behind surfaces that light passes through, once more and from there.
+    #[inline(always)]
+    pub(super) fn lights_beyond(&mut self, context: &Context) {
+        for i in 0..N {
+            self.shadow_beyond[i] = self.lit[i] & (self.light_d.get(i).dot(self.normal.get(i)) < 0.0);
+        }
+        let behind = self.shadow_beyond;
+        if !behind[..self.len].contains(&true) {
+            return;
+        }
+        let (d, tmax, pdf, arriving, lit) = (self.light_d, self.light_tmax, self.light_pdf, self.arriving, self.lit);
+        let (origin, passes, fewer) = (self.origin, self.passes, std::mem::take(&mut self.fewer));
+        self.origin = self.beyond;
+        for i in 0..N {
+            self.passes[i] = !behind[i];
+        }
+        self.lights(context);
+        (self.origin, self.passes) = (origin, passes);
+        self.fewer += fewer;
+        for i in 0..N {
+            // the choice depends on the point: at an end of an interval it may fall on another source, perhaps in front
+            let still = self.lit[i] & (self.light_d.get(i).dot(self.normal.get(i)) < 0.0);
+            self.light_d.set(i, select(behind[i], self.light_d.get(i), d.get(i)));
+            self.light_tmax[i] = if behind[i] { self.light_tmax[i] } else { tmax[i] };
+            self.light_pdf[i] = if behind[i] { self.light_pdf[i] } else { pdf[i] };
+            self.arriving.set(i, select(behind[i], self.arriving.get(i), arriving.get(i)));
+            self.lit[i] = if behind[i] { still } else { lit[i] };
+        }
+    }
+
+    #[inline(always)]
+    fn choose_lights(&mut self, context: &Context) {
         let any_triangle = |few: &[FewLight]| few.iter().any(|light| matches!(light.shape, FewShape::Triangle(_)));
         match context.lights.few() {
             Some(Few::ByPower(few)) => {
@@ -25,7 +64,7 @@ impl Block {
         for i in 0..self.len {
             self.is_ball[i] = false;
             // where a vertex passes there is no point to choose for
-            let facing = Facing::front(self.shading.get(i));
+            let facing = self.facing(i);
             let (chosen, fewer) = if self.passes[i] {
                 (None, false)
             } else {
@@ -60,7 +99,7 @@ impl Block {
     #[inline(always)]
     fn choose_by_power(&mut self, few: &[FewLight]) {
         self.is_ball = [false; N];
-        self.worth = [1.0; N];
+        self.worth = Lanes([1.0; N]);
         for light in few {
             // bits all 1 where it is chosen: a select of floats would be unrolled into branches
             let mut mask = [0; N];
@@ -86,7 +125,7 @@ impl Block {
                 let importance = node.importance(k, o);
                 importances[k][i] = importance;
                 all[i] += importance;
-                facing[i] += importance * node.faces(k, o, Facing::front(self.shading.get(i)));
+                facing[i] += importance * node.faces(k, o, self.facing(i));
                 count[i] += u32::from(importance > 0.0);
                 (sums[k][i], counts[k][i]) = (facing[i], count[i]);
             }
@@ -151,11 +190,19 @@ impl Block {
 
     /// Points on triangles, where one was chosen.
     #[inline(always)]
-    pub(super) fn sample_triangles(&mut self) {
+    fn sample_triangles(&mut self) {
         if !self.any_triangle {
             self.lit = [false; N];
-            return;
+        } else if self.kind.transmits() {
+            self.points_on_triangles::<false>();
+        } else {
+            self.points_on_triangles::<true>();
         }
+    }
+
+    /// `WARPS`: surfaces are lit from one side.
+    #[inline(always)]
+    fn points_on_triangles<const WARPS: bool>(&mut self) {
         for i in 0..N {
             let light = TriangleLight {
                 p0: self.light_p0.get(i),
@@ -166,7 +213,8 @@ impl Block {
                 error: self.light_error[i],
             };
             let o = self.origin.get(i);
-            let (place, warp) = light.warp(o, Facing::front(self.shading.get(i)), [self.place[0][i], self.place[1][i]]);
+            let place = [self.place[0][i], self.place[1][i]];
+            let (place, warp) = if WARPS { light.warp(o, self.facing(i), place) } else { (place, 1.0) };
             self.arriving.set(i, self.radiance.get(i) * (self.worth[i] * warp));
             let (d, tmax, pdf, ok) = light.sample_or_not(o, place);
             self.light_d.set(i, d);
@@ -199,7 +247,7 @@ impl Block {
 
     /// Sources that are neither, one by one; and where nothing was chosen there is no light.
     #[inline(always)]
-    pub(super) fn other_lights(&mut self, context: &Context) {
+    fn other_lights(&mut self, context: &Context) {
         self.sample_balls();
         if context.lights.few().is_some() {
             return;
@@ -223,7 +271,7 @@ impl Block {
                 continue;
             }
             let place = [self.place_bits[0][i], self.place_bits[1][i]];
-            let facing = Facing::front(self.shading.get(i));
+            let facing = self.facing(i);
             let light = context.lights.sample_chosen(choice, self.origin.get(i), facing, place);
             self.take_light(context, i, light);
         }

@@ -2,9 +2,10 @@
 
 use glam::Vec3;
 
-use super::{Block, Lanes, N};
-use crate::material::{Coat, Distribution, Kind, Look, Metal, Scatter};
-use crate::math::Basis;
+use super::lanes::Lanes;
+use super::{Block, N};
+use crate::material::{Coat, Distribution, Glass, Kind, Look, Metal, Principled, Scatter, relative};
+use crate::math::{Basis, select};
 use crate::path::Context;
 use crate::path::vertex::{cosine_direction, onwards, scattered_light, scattered_onwards, towards_light};
 
@@ -32,6 +33,30 @@ impl Block {
                 self.k.set(i, metal.k.into());
                 self.specular.set(i, metal.specular.into());
             }
+            Look::Glass(glass) => {
+                self.alpha[i] = glass.alpha;
+                self.eta.0[0][i] = glass.eta;
+                self.specular.set(i, glass.reflect.into());
+                self.reflectance.set(i, glass.transmit.into());
+            }
+            Look::Principled(p) => {
+                self.reflectance.set(i, p.base_color.into());
+                self.eta.0[0][i] = p.eta;
+                self.alpha[i] = p.roughness;
+                let of = [
+                    p.metallic,
+                    p.spec_trans,
+                    p.spec_tint,
+                    p.sheen,
+                    p.sheen_tint,
+                    p.clearcoat,
+                    p.clearcoat_gloss,
+                    p.flatness,
+                ];
+                for (lanes, share) in self.shares.iter_mut().zip(of) {
+                    lanes[i] = share;
+                }
+            }
         }
     }
 
@@ -39,7 +64,7 @@ impl Block {
     #[inline(always)]
     pub(super) fn enter(&mut self, context: &Context) {
         if let Kind::Coat(_) = self.kind {
-            let mut cosines = [0.0; N];
+            let mut cosines = Lanes([0.0; N]);
             for i in 0..N {
                 cosines[i] = self.shading.get(i).dot(-self.d.get(i));
             }
@@ -62,6 +87,9 @@ impl Block {
             Kind::Coat(Distribution::Beckmann) => self.coats_towards_lights::<BECKMANN>(),
             Kind::Metal(Distribution::Ggx) => self.metals_towards_lights::<GGX>(),
             Kind::Metal(Distribution::Beckmann) => self.metals_towards_lights::<BECKMANN>(),
+            Kind::Glass(Distribution::Ggx) => self.glass_towards_lights::<GGX>(),
+            Kind::Glass(Distribution::Beckmann) => self.glass_towards_lights::<BECKMANN>(),
+            Kind::Principled { .. } => self.principled_towards_lights(),
         }
     }
 
@@ -74,6 +102,9 @@ impl Block {
             Kind::Coat(Distribution::Beckmann) => self.coats_directions::<BECKMANN>(),
             Kind::Metal(Distribution::Ggx) => self.metals_directions::<GGX>(),
             Kind::Metal(Distribution::Beckmann) => self.metals_directions::<BECKMANN>(),
+            Kind::Glass(Distribution::Ggx) => self.glass_directions::<GGX>(),
+            Kind::Glass(Distribution::Beckmann) => self.glass_directions::<BECKMANN>(),
+            Kind::Principled { .. } => self.principled_directions(),
         }
     }
 
@@ -92,6 +123,9 @@ impl Block {
             Kind::Coat(Distribution::Beckmann) => self.coats_onwards::<BECKMANN>(),
             Kind::Metal(Distribution::Ggx) => self.metals_onwards::<GGX>(),
             Kind::Metal(Distribution::Beckmann) => self.metals_onwards::<BECKMANN>(),
+            Kind::Glass(Distribution::Ggx) => self.glass_onwards::<GGX>(),
+            Kind::Glass(Distribution::Beckmann) => self.glass_onwards::<BECKMANN>(),
+            Kind::Principled { .. } => self.principled_onwards(),
         }
     }
 
@@ -117,7 +151,7 @@ impl Block {
     fn coats_towards_lights<const BECKMANN: bool>(&mut self) {
         for i in 0..N {
             let scatter = self.coat_scatters::<BECKMANN>(i, self.shadow_d.get(i));
-            self.contribution.set(i, self.lobe_light(i, scatter));
+            self.contribution.set(i, self.lobe_light(i, scatter, self.normal.get(i)));
         }
     }
 
@@ -125,7 +159,29 @@ impl Block {
     fn metals_towards_lights<const BECKMANN: bool>(&mut self) {
         for i in 0..N {
             let scatter = self.metal_scatters::<BECKMANN>(i, self.shadow_d.get(i));
-            self.contribution.set(i, self.lobe_light(i, scatter));
+            self.contribution.set(i, self.lobe_light(i, scatter, self.normal.get(i)));
+        }
+    }
+
+    #[inline(always)]
+    fn glass_towards_lights<const BECKMANN: bool>(&mut self) {
+        for i in 0..N {
+            let basis = Basis::new(self.shading.get(i));
+            let (wo, wi) = (basis.to_local(-self.d.get(i)), basis.to_local(self.shadow_d.get(i)));
+            let scatter = self.glass::<BECKMANN>(i).eval(wo, wi);
+            let side = self.side(i, wi.z < 0.0);
+            self.contribution.set(i, self.lobe_light(i, scatter, side));
+        }
+    }
+
+    #[inline(always)]
+    fn principled_towards_lights(&mut self) {
+        for i in 0..N {
+            let basis = Basis::new(self.shading.get(i));
+            let (wo, wi) = (basis.to_local(-self.d.get(i)), basis.to_local(self.shadow_d.get(i)));
+            let scatter = self.principled(i).eval(wo, wi, self.front[i]);
+            let side = self.side(i, wi.z < 0.0);
+            self.contribution.set(i, self.lobe_light(i, scatter, side));
         }
     }
 
@@ -161,6 +217,28 @@ impl Block {
     }
 
     #[inline(always)]
+    fn glass_directions<const BECKMANN: bool>(&mut self) {
+        for i in 0..N {
+            let basis = Basis::new(self.shading.get(i));
+            let (wo, u) = (basis.to_local(-self.d.get(i)), [self.direction[0][i], self.direction[1][i]]);
+            let (wi, counts) = self.glass::<BECKMANN>(i).sample(wo, u, self.lobe[i]);
+            self.next_d.set(i, basis.to_world(wi));
+            (self.above[i], self.next_beyond[i]) = (counts, wi.z < 0.0);
+        }
+    }
+
+    #[inline(always)]
+    fn principled_directions(&mut self) {
+        for i in 0..N {
+            let basis = Basis::new(self.shading.get(i));
+            let (wo, u) = (basis.to_local(-self.d.get(i)), [self.direction[0][i], self.direction[1][i]]);
+            let (wi, counts) = self.principled(i).sample_or_not(wo, self.front[i], u, self.lobe[i]);
+            self.next_d.set(i, basis.to_world(wi));
+            (self.above[i], self.next_beyond[i]) = (counts & self.seen[i], wi.z < 0.0);
+        }
+    }
+
+    #[inline(always)]
     fn diffuse_onwards(&mut self) {
         for i in 0..N {
             let (throughput, pdf, fate) = onwards(
@@ -183,7 +261,7 @@ impl Block {
     fn coats_onwards<const BECKMANN: bool>(&mut self) {
         for i in 0..N {
             let scatter = self.coat_scatters::<BECKMANN>(i, self.next_d.get(i));
-            self.take_onwards(i, scatter);
+            self.take_onwards(i, scatter, self.normal.get(i));
         }
     }
 
@@ -191,7 +269,27 @@ impl Block {
     fn metals_onwards<const BECKMANN: bool>(&mut self) {
         for i in 0..N {
             let scatter = self.metal_scatters::<BECKMANN>(i, self.next_d.get(i));
-            self.take_onwards(i, scatter);
+            self.take_onwards(i, scatter, self.normal.get(i));
+        }
+    }
+
+    #[inline(always)]
+    fn glass_onwards<const BECKMANN: bool>(&mut self) {
+        for i in 0..N {
+            let basis = Basis::new(self.shading.get(i));
+            let (wo, wi) = (basis.to_local(-self.d.get(i)), basis.to_local(self.next_d.get(i)));
+            let scatter = self.glass::<BECKMANN>(i).eval(wo, wi);
+            self.take_onwards(i, scatter, self.side(i, self.next_beyond[i]));
+        }
+    }
+
+    #[inline(always)]
+    fn principled_onwards(&mut self) {
+        for i in 0..N {
+            let basis = Basis::new(self.shading.get(i));
+            let (wo, wi) = (basis.to_local(-self.d.get(i)), basis.to_local(self.next_d.get(i)));
+            let scatter = self.principled(i).eval(wo, wi, self.front[i]);
+            self.take_onwards(i, scatter, self.side(i, self.next_beyond[i]));
         }
     }
 
@@ -199,7 +297,7 @@ impl Block {
     #[inline(always)]
     fn shares_of_coats(&self, context: &Context, cosines: &Lanes) -> Lanes {
         let world = context.world;
-        let mut out = [0.0; N];
+        let mut out = Lanes([0.0; N]);
         for i in 0..self.len {
             if !self.passes[i] {
                 let material = &world.materials[world.shapes[self.shape[i] as usize].material as usize];
@@ -225,11 +323,11 @@ impl Block {
     }
 
     #[inline(always)]
-    fn lobe_light(&self, i: usize, scatter: Scatter) -> Vec3 {
+    fn lobe_light(&self, i: usize, scatter: Scatter, normal: Vec3) -> Vec3 {
         scattered_light(
             self.throughput.get(i),
             scatter,
-            self.normal.get(i),
+            normal,
             self.shadow_d.get(i),
             self.light_pdf[i],
             self.arriving.get(i),
@@ -261,12 +359,49 @@ impl Block {
         }
     }
 
+    /// As it is to be seen from where the path is.
     #[inline(always)]
-    fn take_onwards(&mut self, i: usize, scatter: Scatter) {
+    fn glass<const BECKMANN: bool>(&self, i: usize) -> Glass {
+        Glass {
+            distribution: distribution(BECKMANN),
+            alpha: self.alpha[i],
+            eta: relative(self.eta.0[0][i], self.front[i]),
+            reflect: [self.specular.0[0][i], self.specular.0[1][i], self.specular.0[2][i]],
+            transmit: [self.reflectance.0[0][i], self.reflectance.0[1][i], self.reflectance.0[2][i]],
+        }
+    }
+
+    #[inline(always)]
+    fn principled(&self, i: usize) -> Principled {
+        Principled {
+            base_color: [self.reflectance.0[0][i], self.reflectance.0[1][i], self.reflectance.0[2][i]],
+            eta: self.eta.0[0][i],
+            roughness: self.alpha[i],
+            anisotropic: 0.0,
+            metallic: self.shares[0][i],
+            spec_trans: self.shares[1][i],
+            spec_tint: self.shares[2][i],
+            sheen: self.shares[3][i],
+            sheen_tint: self.shares[4][i],
+            clearcoat: self.shares[5][i],
+            clearcoat_gloss: self.shares[6][i],
+            flatness: self.shares[7][i],
+        }
+    }
+
+    /// The geometric normal on the side of a direction that goes beyond the surface or not.
+    #[inline(always)]
+    fn side(&self, i: usize, beyond: bool) -> Vec3 {
+        let normal = self.normal.get(i);
+        select(beyond, -normal, normal)
+    }
+
+    #[inline(always)]
+    fn take_onwards(&mut self, i: usize, scatter: Scatter, normal: Vec3) {
         let (throughput, pdf, fate) = scattered_onwards(
             self.throughput.get(i),
             scatter,
-            self.normal.get(i),
+            normal,
             self.next_d.get(i),
             self.above[i],
             self.go_on[i],

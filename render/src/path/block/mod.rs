@@ -1,48 +1,31 @@
-//! Many vertices at once: triangles that are diffuse, or have one isotropic lobe, in arrays that the compiler turns into vector code.
+//! Many vertices at once: triangles that are diffuse, or have lobes that are isotropic, in arrays that the compiler turns into vector code.
 //!
 //! Vertices are collected by their kind, up to [`N`] of each; then each phase runs over all of them. What a phase does to one vertex is
 //! the same inlined code that the plain way runs (`shade::scatter_plain`), so the bits are the same, and a test compares them. What a block
 //! cannot take after all passes through, and is shaded the plain way in its turn.
 
+mod emit;
+mod lanes;
 mod lights;
 mod lobes;
 
 use glam::Vec3;
 
+use lanes::{Lanes, Lanes3, units};
+
 use super::interaction::{Flat, smooth};
-use super::vertex::{Fate, select, snap};
-use super::{Context, Outcome, PathRay, ShadowRay, wide};
-use crate::light::Choice;
+use super::vertex::{Fate, snap};
+use super::{Context, Outcome, wide};
+use crate::light::{Choice, Facing};
 use crate::material::{Kind, Look};
-use crate::math::{UnitDir, offset_origin, unit};
-use crate::ray::{Hit, PathKey, Ray};
+use crate::math::{UnitDir, offset_origin, select};
+use crate::ray::{Hit, PathKey};
 use crate::sampler::{BSDF, LIGHT, LIGHT_CHOICE, LOBE, ROULETTE, Streams};
 use crate::skip::Skip;
 use crate::texture::{At, Spot};
 
 /// Vertices of a block.
 pub(super) const N: usize = 32;
-
-type Lanes = [f32; N];
-
-/// `N` vectors, by component.
-#[derive(Clone, Copy, Debug)]
-struct Lanes3([Lanes; 3]);
-
-impl Lanes3 {
-    const ZERO: Lanes3 = Lanes3([[0.0; N]; 3]);
-
-    #[inline(always)]
-    fn get(&self, i: usize) -> Vec3 {
-        Vec3::new(self.0[0][i], self.0[1][i], self.0[2][i])
-    }
-    #[inline(always)]
-    fn set(&mut self, i: usize, v: Vec3) {
-        self.0[0][i] = v.x;
-        self.0[1][i] = v.y;
-        self.0[2][i] = v.z;
-    }
-}
 
 /// A block for each kind of vertices that was met.
 #[derive(Clone, Debug)]
@@ -117,6 +100,8 @@ pub(super) struct Block {
     eta: Lanes3,
     k: Lanes3,
     nonlinear: [bool; N],
+    /// Parameters of the principled model: metallic, spec_trans, spec_tint, sheen, sheen_tint, clearcoat, clearcoat_gloss, flatness.
+    shares: [Lanes; 8],
     internal: Lanes,
     entering: Lanes,
     leaving: Lanes,
@@ -126,6 +111,19 @@ pub(super) struct Block {
     shading: Lanes3,
     origin: Lanes3,
     seen: [bool; N],
+    /// Where light is chosen for: [`crate::light::Facing`].
+    faced: Lanes3,
+    least: f32,
+    // of what light passes through
+    front: [bool; N],
+    /// Origin of rays that leave on the other side, and those of the shadow ray and of the next one.
+    beyond: Lanes3,
+    shadow_o: Lanes3,
+    next_o: Lanes3,
+    /// Whether the shadow ray does.
+    shadow_beyond: [bool; N],
+    /// Whether the next ray does.
+    next_beyond: [bool; N],
     // numbers
     direction: [Lanes; 2],
     go_on: Lanes,
@@ -176,34 +174,10 @@ pub(super) struct Block {
     fate: [Fate; N],
 }
 
-/// Sets the lanes where the mask's bits are 1.
-#[inline(always)]
-fn set(lanes: &mut Lanes, x: f32, mask: &[u32; N]) {
-    for i in 0..N {
-        lanes[i] = f32::from_bits((x.to_bits() & mask[i]) | (lanes[i].to_bits() & !mask[i]));
-    }
-}
-
-/// The same of vectors.
-#[inline(always)]
-fn set3(lanes: &mut Lanes3, v: Vec3, mask: &[u32; N]) {
-    set(&mut lanes.0[0], v.x, mask);
-    set(&mut lanes.0[1], v.y, mask);
-    set(&mut lanes.0[2], v.z, mask);
-}
-
-/// Numbers in [0, 1).
-#[inline(always)]
-fn units(lanes: &mut Lanes, raw: &[u32; N]) {
-    for i in 0..N {
-        lanes[i] = unit(raw[i]);
-    }
-}
-
 impl Block {
     /// An empty one.
     pub(super) fn new(kind: Kind) -> Block {
-        let lanes = [0.0; N];
+        let lanes = Lanes([0.0; N]);
         Block {
             kind,
             len: 0,
@@ -234,6 +208,7 @@ impl Block {
             eta: Lanes3::ZERO,
             k: Lanes3::ZERO,
             nonlinear: [false; N],
+            shares: [lanes; 8],
             internal: lanes,
             entering: lanes,
             leaving: lanes,
@@ -242,6 +217,14 @@ impl Block {
             shading: Lanes3::ZERO,
             origin: Lanes3::ZERO,
             seen: [false; N],
+            faced: Lanes3::ZERO,
+            least: 0.0,
+            front: [false; N],
+            beyond: Lanes3::ZERO,
+            shadow_o: Lanes3::ZERO,
+            next_o: Lanes3::ZERO,
+            shadow_beyond: [false; N],
+            next_beyond: [false; N],
             direction: [lanes; 2],
             go_on: lanes,
             place: [lanes; 2],
@@ -403,15 +386,30 @@ impl Block {
         self.geometry();
         self.enter(context);
         self.numbers(context);
-        self.choose_lights(context);
-        self.sample_triangles();
-        self.other_lights(context);
+        self.lights(context);
+        if self.kind.transmits() {
+            self.lights_beyond(context);
+        }
         let skips_unlit = context.skips.makes(Skip::Shadows);
         self.shadow_rays(context, !skips_unlit);
         if skips_unlit {
             self.count_unlit();
         }
         self.next_rays(context);
+        self.origins();
+    }
+
+    /// Where rays begin.
+    #[inline(always)]
+    fn origins(&mut self) {
+        (self.shadow_o, self.next_o) = (self.origin, self.origin);
+        if self.kind.transmits() {
+            for i in 0..N {
+                let (origin, beyond) = (self.origin.get(i), self.beyond.get(i));
+                self.shadow_o.set(i, select(self.shadow_beyond[i], beyond, origin));
+                self.next_o.set(i, select(self.next_beyond[i], beyond, origin));
+            }
+        }
     }
 
     #[inline(always)]
@@ -423,6 +421,9 @@ impl Block {
             self.seen[i] = flat.from_front | self.two_sided[i];
             self.passes[i] |= !flat.sound;
         }
+        if self.kind.has_sides() {
+            self.both_sides();
+        }
         self.shading = self.normal;
         if self.any_smooth {
             for i in 0..N {
@@ -432,6 +433,27 @@ impl Block {
                 self.shading.set(i, select(self.is_smooth[i], shading, normal));
             }
         }
+        let lit_from = if self.kind.transmits() { Facing::ANY } else { Facing::front(Vec3::ZERO) };
+        self.least = lit_from.least;
+        self.faced = if self.kind.transmits() { Lanes3::ZERO } else { self.shading };
+    }
+
+    /// Of surfaces whose sides differ.
+    #[inline(always)]
+    fn both_sides(&mut self) {
+        let through = self.kind.transmits();
+        for i in 0..N {
+            let flat = Flat::new(self.p0.get(i), self.p1.get(i), self.p2.get(i), self.u[i], self.v[i], self.d.get(i));
+            self.beyond.set(i, offset_origin(&flat.position, -flat.normal));
+            self.front[i] = flat.from_front;
+            self.seen[i] |= through;
+        }
+    }
+
+    /// What light is chosen for.
+    #[inline(always)]
+    fn facing(&self, i: usize) -> Facing {
+        Facing { normal: self.faced.get(i), least: self.least }
     }
 
     #[inline(always)]
@@ -498,80 +520,5 @@ impl Block {
             unlit += u32::from((i < self.len) & self.seen[i] & !self.casts[i] & !self.passes[i]);
         }
         self.unlit = u64::from(unlit);
-    }
-
-    /// Appends what came of vertices none of which passes: without branches that depend on them.
-    fn emit(&mut self, out: &mut Outcome) {
-        let (mut shadows, mut nexts) = ([0u8; N], [0u8; N]);
-        let (mut shadow, mut next, mut roulette) = (0, 0, 0);
-        for i in 0..self.len {
-            // written before it is known whether it counts
-            shadows[shadow & (N - 1)] = i as u8;
-            shadow += usize::from(self.casts[i]);
-            nexts[next & (N - 1)] = i as u8;
-            next += usize::from(self.fate[i] == Fate::On);
-            roulette += u64::from(self.fate[i] == Fate::Roulette);
-        }
-        out.counters.roulette += roulette;
-        out.counters.absorbed += (self.len - next) as u64 - roulette;
-        let place = |i: &u8| usize::from(*i) & (N - 1);
-        let (shadows, nexts) = (&shadows[..shadow], &nexts[..next]);
-        out.shadow.extend(shadows.iter().map(|i| self.shadow(place(i))));
-        out.shadow_rays.extend(shadows.iter().map(|i| self.shadow_ray(place(i))));
-        out.next.extend(nexts.iter().map(|i| self.next(place(i))));
-        out.next_rays.extend(nexts.iter().map(|i| self.next_ray(place(i))));
-    }
-
-    /// The same in the order of the vertices, where some pass.
-    fn emit_mixed(&mut self, out: &mut Outcome, mut plain: impl FnMut(usize, PathKey, Vec3, &mut Outcome)) {
-        for i in 0..self.len {
-            if self.passes[i] {
-                plain(self.index[i] as usize, self.key[i], self.throughput.get(i), out);
-                continue;
-            }
-            if self.casts[i] {
-                out.shadow.push(self.shadow(i));
-                out.shadow_rays.push(self.shadow_ray(i));
-            }
-            match self.fate[i] {
-                Fate::On => {
-                    out.next.push(self.next(i));
-                    out.next_rays.push(self.next_ray(i));
-                }
-                Fate::Absorbed => out.counters.absorbed += 1,
-                Fate::Roulette => out.counters.roulette += 1,
-            }
-        }
-    }
-
-    #[inline(always)]
-    fn shadow(&self, i: usize) -> ShadowRay {
-        ShadowRay {
-            o: self.origin.get(i).to_array(),
-            dir: self.shadow_dir[i],
-            tmax: self.light_tmax[i],
-            contribution: self.contribution.get(i).to_array(),
-            key: self.key[i],
-        }
-    }
-    #[inline(always)]
-    fn shadow_ray(&self, i: usize) -> Ray {
-        let (o, d) = (self.origin.get(i).to_array(), self.shadow_d.get(i).to_array());
-        Ray { o, tmin: 0.0, d, tmax: self.light_tmax[i] }
-    }
-    #[inline(always)]
-    fn next(&self, i: usize) -> PathRay {
-        PathRay {
-            o: self.origin.get(i).to_array(),
-            dir: self.next_dir[i],
-            key: PathKey { vertex: self.key[i].vertex + 1, ..self.key[i] },
-            throughput: self.next_throughput.get(i).to_array(),
-            pdf: self.next_pdf[i],
-        }
-    }
-    #[inline(always)]
-    fn next_ray(&self, i: usize) -> Ray {
-        let (o, d) = (self.origin.get(i).to_array(), self.next_d.get(i).to_array());
-        Ray { o, tmin: 0.0, d, tmax: f32::INFINITY }
     }
 }

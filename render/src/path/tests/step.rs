@@ -11,7 +11,7 @@ use crate::film::FilmPart;
 use crate::filter::Filter;
 use crate::frame::Frame;
 use crate::light::{Lights, SkyMap};
-use crate::material::{Bsdf, Detail, Distribution, Slot, Textured, Transmittance};
+use crate::material::{Bsdf, Detail, Distribution, Principled, Slot, Textured, Transmittance};
 use crate::math::UnitDir;
 use crate::path::reference::{self, Tracer};
 use crate::path::shade::shade_plain;
@@ -140,9 +140,9 @@ fn motley() -> Scene {
     scene
 }
 
-/// The Cornell box, open in front, of coats and metals, some of them textured, with smooth normals here and there and a sky that is a picture
-/// with a sun: all that blocks know.
-fn glossy() -> Scene {
+/// The Cornell box, open in front, of coats and metals or of glass, some of them textured, with smooth normals here and there and a sky that is a
+/// picture with a sun: all that blocks know.
+fn glossy(of_glass: bool) -> Scene {
     let mut scene = cornell::scene();
     let image = scene.image([2, 2], vec![200, 10, 30, 0, 90, 255, 128, 128, 128, 255, 255, 0]);
     // of another size: what a look-up of one reads is not what that of the other reads
@@ -167,7 +167,14 @@ fn glossy() -> Scene {
         textured: slots.iter().zip([image, other]).map(|(&slot, image)| Textured::new(slot, image)).collect(),
         ..Detail::default()
     };
-    let materials = [
+    let glass = |alpha: f32, eta: f32, distribution| Bsdf::RoughDielectric {
+        distribution,
+        alpha: [alpha; 2],
+        eta,
+        reflect: [0.9, 1.0, 0.8],
+        transmit: [1.0, 0.7, 0.9],
+    };
+    let mut materials = vec![
         scene.material(coat(0.1, 1.5, false, Distribution::Ggx), true),
         scene.material(coat(0.4, 1.9, true, Distribution::Beckmann), false),
         scene.material(metal(0.05, Distribution::Ggx), true),
@@ -177,6 +184,43 @@ fn glossy() -> Scene {
         scene.detailed(metal(0.2, Distribution::Ggx), paint(&[Slot::AlphaU])),
         scene.diffuse(0.7),
     ];
+    if of_glass {
+        let turned = [0.3, 0.1];
+        let principled = Principled {
+            base_color: [0.8, 0.5, 0.2],
+            eta: 1.5,
+            roughness: 0.4,
+            anisotropic: 0.0,
+            metallic: 0.3,
+            spec_trans: 0.0,
+            spec_tint: 0.3,
+            sheen: 0.4,
+            sheen_tint: 0.6,
+            clearcoat: 0.7,
+            clearcoat_gloss: 0.5,
+            flatness: 0.2,
+        };
+        let Bsdf::RoughDielectric { distribution, eta, reflect, transmit, .. } = glass(0.3, 1.5, Distribution::Ggx)
+        else {
+            unreachable!()
+        };
+        materials = vec![
+            scene.material(glass(0.1, 1.5, Distribution::Ggx), false),
+            scene.material(glass(0.4, 0.8, Distribution::Beckmann), true),
+            scene.material(Bsdf::Principled(Principled { spec_trans: 0.8, ..principled }), false),
+            scene.detailed(Bsdf::Principled(principled), paint(&[Slot::Diffuse, Slot::Roughness])),
+            scene.material(Bsdf::Principled(Principled { anisotropic: 0.5, ..principled }), false),
+            scene.detailed(
+                Bsdf::Principled(Principled { spec_trans: 0.5, ..principled }),
+                paint(&[Slot::Flatness, Slot::SpecTrans]),
+            ),
+            scene.detailed(glass(0.2, 1.3, Distribution::Ggx), paint(&[Slot::Specular, Slot::Transmit])),
+            scene.detailed(glass(0.2, 1.8, Distribution::Beckmann), paint(&[Slot::Alpha, Slot::Transmit])),
+            scene.material(Bsdf::RoughDielectric { distribution, alpha: turned, eta, reflect, transmit }, false),
+            scene.diffuse(0.7),
+        ];
+    }
+    assert!(scene.shapes.iter().filter(|s| s.emission.is_none()).count() >= materials.len(), "all of them are met");
     for (k, shape) in scene.shapes.iter_mut().filter(|s| s.emission.is_none()).enumerate() {
         shape.material = materials[k % materials.len()];
     }
@@ -222,9 +266,23 @@ fn balls(count: usize, with_lamp: bool) -> Scene {
 #[test]
 fn batches_do_not_matter() {
     let balls = [(balls(1, false), 1), (balls(3, false), 2), (balls(4, true), 1)];
-    let others = [(cornell::scene(), 1), (lamps(3), 2), (lamps(9), 1), (motley(), 3), (glossy(), 2)];
+    let others =
+        [(cornell::scene(), 1), (lamps(3), 2), (lamps(9), 1), (motley(), 3), (glossy(false), 2), (glossy(true), 1)];
+    // lamps of every kind behind glass and before it
+    let mut shone_through = lamps(9);
+    let glass = shone_through.material(
+        Bsdf::RoughDielectric {
+            distribution: Distribution::Ggx,
+            alpha: [0.3; 2],
+            eta: 1.5,
+            reflect: [1.0; 3],
+            transmit: [1.0; 3],
+        },
+        false,
+    );
+    shone_through.shapes.iter_mut().step_by(2).for_each(|shape| shape.material = glass);
     assert!(balls.iter().all(|(scene, _)| scene.lights().few().is_some()));
-    for (scene, split) in balls.into_iter().chain(others) {
+    for (scene, split) in balls.into_iter().chain(others).chain([(shone_through, 1)]) {
         for skips in [Skips::ALL, Skips::NONE] {
             check_batches(&scene, split, skips);
         }
@@ -234,14 +292,20 @@ fn batches_do_not_matter() {
 /// In any order: a film adds up exactly, and which rays are traced together changes none.
 #[track_caller]
 fn same(a: &Outcome, b: &Outcome) {
-    let sorted = |o: &Outcome| {
-        let mut bytes: Vec<Vec<u8>> = o.next.iter().map(|x| bytemuck::bytes_of(x).to_vec()).collect();
-        bytes.extend(o.shadow.iter().map(|x| bytemuck::bytes_of(x).to_vec()));
-        bytes.extend(o.light.iter().map(|x| bytemuck::bytes_of(x).to_vec()));
-        bytes.sort();
-        bytes
-    };
-    assert_eq!(sorted(a), sorted(b));
+    #[track_caller]
+    fn lists<T: bytemuck::Pod + PartialEq + std::fmt::Debug>(a: &[T], b: &[T]) {
+        let sorted = |list: &[T]| {
+            let mut list = list.to_vec();
+            list.sort_by(|x, y| bytemuck::bytes_of(x).cmp(bytemuck::bytes_of(y)));
+            list
+        };
+        let (a, b) = (sorted(a), sorted(b));
+        let first = a.iter().zip(&b).find(|(x, y)| bytemuck::bytes_of(*x) != bytemuck::bytes_of(*y));
+        assert!(first.is_none() && a.len() == b.len(), "{} and {}, of them first {first:?}", a.len(), b.len());
+    }
+    lists(&a.shadow, &b.shadow);
+    lists(&a.next, &b.next);
+    lists(&a.light, &b.light);
 }
 
 fn check_batches(scene: &Scene, split: u32, skips: Skips) {
