@@ -138,7 +138,6 @@ impl Tracer {
         let Tracer { kernel, counters, stack, sorter, .. } = self;
         // triangles first, then the spheres that are nearer
         let sphere_root = forest.sphere_root();
-        let asks = |state: &State| sphere_root.filter(|_| !(ANY && state.prim != MISS));
         let order = match (sorter, forest.bounds()) {
             (Some(sorter), Some(bounds)) => sorter.order(bounds, rays),
             _ => &[],
@@ -147,8 +146,8 @@ impl Tracer {
             #[cfg(all(target_arch = "x86_64", not(feature = "double")))]
             Kernel::Avx2 | Kernel::Avx512 => {
                 let (kernel, mut of_spheres) = (*kernel, Counters::default());
-                let mut finish = |i: usize, state: &mut State| {
-                    if let Some(root) = asks(state) {
+                let mut finish = |i: usize, state: &mut State, meets: bool| {
+                    if let Some(root) = sphere_root.filter(|_| meets) {
                         spheres::trace::<ANY>(kernel, forest, root, &rays[i], state, stack, &mut of_spheres);
                     }
                     done(i, state);
@@ -162,7 +161,7 @@ impl Tracer {
                     let i = order.get(k).map_or(k, |&i| i as usize);
                     let mut state = State::new(&rays[i], real(forest.largest()));
                     scalar::triangles(forest, &mut state, ANY, stack, counters);
-                    if let Some(root) = asks(&state) {
+                    if let Some(root) = sphere_root.filter(|_| !(ANY && state.prim != MISS)) {
                         scalar::spheres(forest, root, &rays[i], &mut state, ANY, stack, counters);
                     }
                     done(i, &state);

@@ -23,7 +23,7 @@ use super::start::start;
 use super::triangle::{SMALL_AREA, barycentrics_of_small};
 use super::vector::{Avx2, Avx512, InstructionSet, sort4, sort8};
 use super::{Counters, Kernel, accept, runs};
-use crate::ray::Ray;
+use crate::ray::{MISS, Ray};
 
 /// Rays in flight; 32 are 1 to 14 % slower where the tree is larger than the caches, 64 are no faster (docs/benchmarks/tried.md).
 const IN_FLIGHT: usize = 48;
@@ -73,8 +73,8 @@ struct Found {
     lane: usize,
 }
 
-/// Traces `rays[order[..]]`, or all rays as they stand when `order` is empty, and tells `done` each ray's number and final
-/// state.
+/// Traces `rays[order[..]]`, or all rays as they stand when `order` is empty, through the triangles, and tells `done` each ray's number and final
+/// state, and whether it may meet spheres that count: whether it enters a child of their root.
 ///
 /// # Panics
 /// When the kernel is none of this module or the processor cannot run it.
@@ -84,7 +84,7 @@ pub(super) fn trace<const ANY: bool>(
     forest: &Forest,
     rays: &[Ray],
     order: &[u32],
-    done: &mut impl FnMut(usize, &mut State),
+    done: &mut impl FnMut(usize, &mut State, bool),
     counters: &mut Counters,
 ) {
     assert!(runs(kernel));
@@ -102,7 +102,7 @@ pub(super) fn trace<const ANY: bool>(
 /// # Safety
 /// The processor has what is enabled here.
 #[target_feature(enable = "avx2,fma,bmi1,bmi2,popcnt,lzcnt,avx512f,avx512vl,avx512dq,avx512bw")]
-unsafe fn avx512<const ANY: bool, D: FnMut(usize, &mut State)>(
+unsafe fn avx512<const ANY: bool, D: FnMut(usize, &mut State, bool)>(
     lanes: &mut Lanes,
     forest: &Forest,
     rays: &[Ray],
@@ -119,7 +119,7 @@ unsafe fn avx512<const ANY: bool, D: FnMut(usize, &mut State)>(
 /// # Safety
 /// The processor has what is enabled here.
 #[target_feature(enable = "avx2,fma,bmi1,bmi2,popcnt,lzcnt")]
-unsafe fn avx2<const ANY: bool, D: FnMut(usize, &mut State)>(
+unsafe fn avx2<const ANY: bool, D: FnMut(usize, &mut State, bool)>(
     lanes: &mut Lanes,
     forest: &Forest,
     rays: &[Ray],
@@ -134,7 +134,7 @@ unsafe fn avx2<const ANY: bool, D: FnMut(usize, &mut State)>(
 /// # Safety
 /// Called where the features of `I` are enabled.
 #[inline(always)]
-unsafe fn rounds<I: InstructionSet, const ANY: bool, D: FnMut(usize, &mut State)>(
+unsafe fn rounds<I: InstructionSet, const ANY: bool, D: FnMut(usize, &mut State, bool)>(
     lanes: &mut Lanes,
     forest: &Forest,
     rays: &[Ray],
@@ -146,6 +146,7 @@ unsafe fn rounds<I: InstructionSet, const ANY: bool, D: FnMut(usize, &mut State)
     let stride = lanes.stride;
     let arena = forest.arena().as_ptr();
     let (root, largest) = (forest.root(), forest.largest());
+    let sphere_root = forest.sphere_root();
     let total = if order.is_empty() { rays.len() } else { order.len() };
     let number = |i: usize| if order.is_empty() { i } else { order[i] as usize };
 
@@ -290,7 +291,13 @@ unsafe fn rounds<I: InstructionSet, const ANY: bool, D: FnMut(usize, &mut State)
             for i in (0..finishes).rev() {
                 let lane = *finished.add(i) as usize;
                 let state = &mut *states.add(lane);
-                done(state.ray as usize, state);
+                let mut meets = false;
+                if let Some(root) = sphere_root.filter(|_| !(ANY && state.prim != MISS)) {
+                    meets = boxes::<I>(arena.add(offset(root)), state).0 != 0;
+                    // whoever meets some visits the node once more, and counts it
+                    counters.nodes += u64::from(!meets & (state.tmin <= state.tmax));
+                }
+                done(state.ray as usize, state, meets);
                 if next < total {
                     if !order.is_empty() {
                         let ahead = order[(next + IN_FLIGHT).min(total - 1)] as usize;
