@@ -3,6 +3,8 @@
 use super::arena::Arena;
 use super::block::{HEADER, Sphere, read_sphere, sizes};
 use super::check::{BlockError, Record, Tree, check};
+#[cfg(all(target_arch = "x86_64", not(feature = "double")))]
+use super::few::Few;
 use super::ids::Ids;
 use super::layout::*;
 use super::regions::Regions;
@@ -28,6 +30,9 @@ pub struct Forest {
     next: u64,
     /// Tree over the triangles, and over the spheres; `None` before `finish`.
     roots: Option<[Tree; 2]>,
+    /// What is there as lists, when it is little; `None` before `finish`.
+    #[cfg(all(target_arch = "x86_64", not(feature = "double")))]
+    few: Option<Few>,
     /// Parts of the arena that the top trees take.
     tops: Vec<(u64, u64)>,
     largest: f32,
@@ -131,6 +136,8 @@ impl Forest {
             blocks: Vec::new(),
             next: 0,
             roots: Some([EMPTY_TREE; 2]),
+            #[cfg(all(target_arch = "x86_64", not(feature = "double")))]
+            few: None,
             tops: Vec::new(),
             largest: 0.0,
             used: 0,
@@ -192,6 +199,10 @@ impl Forest {
         let spheres = self.top(|b| b.sphere_tree)?;
         self.largest = triangles.aabb.largest().max(spheres.aabb.largest());
         self.roots = Some([triangles, spheres]);
+        #[cfg(all(target_arch = "x86_64", not(feature = "double")))]
+        {
+            self.few = Few::of(self, self.root(), self.sphere_root());
+        }
         Ok(())
     }
 
@@ -281,6 +292,11 @@ impl Forest {
     /// The triangles' root, always a node.
     pub(super) fn root(&self) -> u32 {
         node_ref(self.tree(0).root)
+    }
+    /// The primitives as lists, if they are few.
+    #[cfg(all(target_arch = "x86_64", not(feature = "double")))]
+    pub(super) fn few(&self) -> Option<&Few> {
+        self.few.as_ref()
     }
     /// Stack entries that a traversal of the triangles can hold.
     pub(super) fn stack(&self) -> usize {
@@ -378,6 +394,10 @@ impl Forest {
     /// Drops the top trees.
     fn unfinish(&mut self) {
         self.roots = None;
+        #[cfg(all(target_arch = "x86_64", not(feature = "double")))]
+        {
+            self.few = None;
+        }
         for (at, bytes) in std::mem::take(&mut self.tops) {
             self.used -= bytes;
             self.give(at, bytes);

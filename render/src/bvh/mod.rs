@@ -8,6 +8,8 @@ pub mod block;
 mod boxes;
 mod check;
 mod collapse;
+#[cfg(all(target_arch = "x86_64", not(feature = "double")))]
+mod few;
 pub mod forest;
 mod ids;
 mod layout;

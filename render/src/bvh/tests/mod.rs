@@ -153,6 +153,46 @@ fn every_kernel_gives_the_brute_force_answer() {
 }
 
 #[test]
+#[cfg(all(target_arch = "x86_64", not(feature = "double")))]
+fn few_primitives_give_the_brute_force_answer() {
+    let mut random = Random::new(41);
+    for round in 0..40 {
+        // needles stand in several leaves, grids have equal distances and shared edges
+        let mut triangles = match round % 4 {
+            0 => soup(&mut random, round, 1.0, 0.5),
+            1 => slivers(&mut random, 1 + round / 3),
+            2 => grids(1 + round / 16),
+            _ => soup(&mut random, 3, 1.0, 2.0),
+        };
+        if let Some(&first) = triangles.first() {
+            triangles.extend([first; 3]);
+        }
+        let scale = [1.0, 1.0, 1e-9, 1e-30, 1e6][round % 5];
+        let triangles: Vec<Triangle> = triangles.iter().map(|t| t.map(|p| p.map(|x| x * scale))).collect();
+        let mut spheres = balls(&mut random, if round % 3 == 0 { 0 } else { round % 14 }, scale);
+        if let Some(&first) = spheres.first() {
+            spheres.push(first);
+        }
+        let n = triangles.len() + spheres.len();
+        let ids: Vec<PrimId> = (0..n as PrimId).collect();
+        // one block, and two with copies in both
+        let (even, odd): (Vec<PrimId>, Vec<PrimId>) = ids.iter().partition(|&id| id % 2 == 0);
+        let doubled = [&odd[..], &even[..even.len().min(4)]].concat();
+        let sorted = |mut ids: Vec<PrimId>| {
+            ids.sort_unstable();
+            ids
+        };
+        let two = [part(&triangles, &spheres, &even), part(&triangles, &spheres, &sorted(doubled))];
+        let forests = [forest(&[block(&triangles, &spheres)]), forest(&two)];
+        assert!(forests.iter().all(|f| f.few().is_some()), "{n} are few");
+        let rays = rays_for(&mut random, &triangles, 403, scale);
+        check_all(&forests, &triangles, &spheres, &rays);
+    }
+    let many = forest(&[block(&soup(&mut random, 200, 1.0, 0.1), &[])]);
+    assert!(many.few().is_none(), "a tree serves many");
+}
+
+#[test]
 fn adversarial_soups_give_the_brute_force_answer() {
     let mut random = Random::new(2);
     let scale = |triangles: &[Triangle], s: f32| -> Vec<Triangle> {

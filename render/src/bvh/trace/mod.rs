@@ -1,5 +1,7 @@
 //! Tracing batches of rays through a forest: nearest hit, or whether there is any.
 
+#[cfg(all(target_arch = "x86_64", not(feature = "double")))]
+mod packet;
 mod scalar;
 mod setup;
 mod sphere;
@@ -12,6 +14,8 @@ mod triangle;
 mod vector;
 #[cfg(all(target_arch = "x86_64", not(feature = "double")))]
 mod wide;
+#[cfg(all(target_arch = "x86_64", not(feature = "double")))]
+mod width;
 
 pub(super) use scalar::read_triangle;
 use setup::State;
@@ -31,7 +35,7 @@ pub enum Kernel {
     Scalar,
     /// AVX2 and FMA.
     Avx2,
-    /// AVX-512 F, VL, DQ, BW, on vectors of 256 bits.
+    /// AVX-512 F, VL, DQ, BW; on vectors of 256 bits, but for forests of few primitives.
     Avx512,
 }
 
@@ -105,14 +109,7 @@ impl Tracer {
     /// When there are not as many hits as rays, or the forest was changed and not finished.
     pub fn closest(&mut self, forest: &Forest, rays: &[Ray], hits: &mut [Hit]) {
         assert_eq!(rays.len(), hits.len(), "one hit for each ray");
-        self.run::<false>(forest, rays, &mut |i, state: &State| {
-            hits[i] = if state.prim == MISS {
-                Hit::miss(rays[i].tmax)
-            } else {
-                let [u, v] = state.uv;
-                Hit { t: state.tmax, u, v, prim: state.prim, leaf: state.leaf, lane: state.lane }
-            };
-        });
+        self.run::<false>(forest, rays, &mut |i, hit| hits[i] = hit);
     }
 
     /// Writes for each ray whether anything lies at `tmin < t <= tmax`. Which rays hit nothing: see [`Tracer::closest`].
@@ -121,21 +118,26 @@ impl Tracer {
     /// As [`Tracer::closest`].
     pub fn any(&mut self, forest: &Forest, rays: &[Ray], occluded: &mut [bool]) {
         assert_eq!(rays.len(), occluded.len(), "one answer for each ray");
-        self.run::<true>(forest, rays, &mut |i, state: &State| occluded[i] = state.prim != MISS);
+        self.run::<true>(forest, rays, &mut |i, hit: Hit| occluded[i] = hit.is_hit());
     }
 
-    /// Traces and tells `done` each ray's number and final state.
-    fn run<const ANY: bool>(&mut self, forest: &Forest, rays: &[Ray], done: &mut impl FnMut(usize, &State)) {
+    /// Traces and tells `done` each ray's number and hit; with `ANY`, only whether there is one.
+    fn run<const ANY: bool>(&mut self, forest: &Forest, rays: &[Ray], done: &mut impl FnMut(usize, Hit)) {
         assert!(forest.is_finished(), "a forest is traced after finish()");
         self.counters.rays += rays.len() as u64;
         // numbers of rays in flight are of 32 bits
         for (i, part) in rays.chunks(MAX_BATCH).enumerate() {
-            self.run_part::<ANY>(forest, part, &mut |k, state| done(i * MAX_BATCH + k, state));
+            self.run_part::<ANY>(forest, part, &mut |k, hit| done(i * MAX_BATCH + k, hit));
         }
     }
 
-    fn run_part<const ANY: bool>(&mut self, forest: &Forest, rays: &[Ray], done: &mut impl FnMut(usize, &State)) {
+    fn run_part<const ANY: bool>(&mut self, forest: &Forest, rays: &[Ray], done: &mut impl FnMut(usize, Hit)) {
         let Tracer { kernel, counters, stack, sorter, .. } = self;
+        #[cfg(all(target_arch = "x86_64", not(feature = "double")))]
+        if let Some(few) = forest.few().filter(|few| packet::lanes(*kernel).is_some_and(|lanes| few.suits(lanes))) {
+            packet::trace::<ANY>(*kernel, forest, few, rays, done, counters);
+            return;
+        }
         // triangles first, then the spheres that are nearer
         let sphere_root = forest.sphere_root();
         let order = match (sorter, forest.bounds()) {
@@ -150,7 +152,7 @@ impl Tracer {
                     if let Some(root) = sphere_root.filter(|_| meets) {
                         spheres::trace::<ANY>(kernel, forest, root, &rays[i], state, stack, &mut of_spheres);
                     }
-                    done(i, state);
+                    done(i, state.hit(&rays[i]));
                 };
                 wide::trace::<ANY>(kernel, &mut self.lanes, forest, rays, order, &mut finish, counters);
                 counters.nodes += of_spheres.nodes;
@@ -164,7 +166,7 @@ impl Tracer {
                     if let Some(root) = sphere_root.filter(|_| !(ANY && state.prim != MISS)) {
                         scalar::spheres(forest, root, &rays[i], &mut state, ANY, stack, counters);
                     }
-                    done(i, &state);
+                    done(i, state.hit(&rays[i]));
                 }
             }
         }

@@ -48,7 +48,7 @@
 //! Spheres are tested in f64 ([`super::sphere`]); what (1) and (3) are for them is derived there, and is smaller.
 
 use super::super::layout::MAX_COORDINATE;
-use crate::ray::{MISS, Ray};
+use crate::ray::{Hit, MISS, Ray};
 use crate::real::{Vec4, f32, real};
 
 /// Smallest and largest magnitude of a direction's largest component: 2^-30 and 2^30.
@@ -125,6 +125,16 @@ impl State {
         let mut state = State::NOTHING;
         state.start(ray, largest);
         state
+    }
+
+    /// What the ray hit so far.
+    #[inline(always)]
+    pub fn hit(&self, ray: &Ray) -> Hit {
+        if self.prim == MISS {
+            return Hit::miss(ray.tmax);
+        }
+        let [u, v] = self.uv;
+        Hit { t: self.tmax, u, v, prim: self.prim, leaf: self.leaf, lane: self.lane }
     }
 
     /// Sets all but `top`, `current` and `ray` to the start of a ray.
