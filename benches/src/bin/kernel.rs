@@ -14,6 +14,9 @@ use rayherd_render::ray::{Hit, PrimId, Ray};
 use rayherd_render::world::Primitive;
 
 const SETS: [&str; 4] = ["primary", "bounce1", "bounce2", "shadow"];
+/// The primary rays once more, as the trace loop traces those of a camera: in its batches, and in packets.
+const CAMERA: &str = "camera";
+const BATCH: usize = 2048;
 const KERNELS: [Kernel; 3] = [Kernel::Avx512, Kernel::Avx2, Kernel::Scalar];
 
 fn main() -> anyhow::Result<()> {
@@ -75,8 +78,9 @@ fn load(dir: &Path, blocks: usize) -> anyhow::Result<Forest> {
 fn measure(dir: &Path, repetitions: usize, blocks: usize, kernels: &[Kernel]) -> anyhow::Result<()> {
     let forest = load(dir, blocks)?;
     let mut tracers: Vec<Tracer> = kernels.iter().filter_map(|&k| Tracer::new(k).ok()).collect();
-    for set in SETS {
-        let rays: Vec<Ray> = read(&dir.join(format!("{set}.rays")))?;
+    for set in SETS.into_iter().chain([CAMERA]) {
+        let file = if set == CAMERA { SETS[0] } else { set };
+        let rays: Vec<Ray> = read(&dir.join(format!("{file}.rays")))?;
         let is_shadow = set == "shadow";
         let mut times = vec![Vec::new(); tracers.len()];
         let mut hits = vec![Hit::miss(0.0); rays.len()];
@@ -90,6 +94,10 @@ fn measure(dir: &Path, repetitions: usize, blocks: usize, kernels: &[Kernel]) ->
                 let (before, cpu) = (tracer.counters(), thread_cpu());
                 if is_shadow {
                     tracer.any(&forest, &rays, &mut occluded);
+                } else if set == CAMERA {
+                    for (rays, hits) in rays.chunks(BATCH).zip(hits.chunks_mut(BATCH)) {
+                        tracer.closest_coherent(&forest, rays, hits);
+                    }
                 } else {
                     tracer.closest(&forest, &rays, &mut hits);
                 }

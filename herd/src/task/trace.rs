@@ -140,7 +140,10 @@ impl Loop {
                 return Ok(());
             }
             self.hits.resize(pending.len() - from, Hit::miss(0.0));
-            self.tracer.closest(forest, &rays[from..], &mut self.hits);
+            // the camera's come last
+            let (hits, camera_hits) = self.hits.split_at_mut(waiting - from);
+            self.tracer.closest(forest, &rays[from..waiting], hits);
+            self.tracer.closest_coherent(forest, &rays[waiting..], camera_hits);
             self.clock.lap(Part::Closest, self.hits.len());
             self.skipped.add(Skip::Walk, self.hits.len() as u64);
             let (paths, traced, hits, out) = (&pending[from..], &rays[from..], &self.hits, &mut self.outcome);
@@ -260,7 +263,11 @@ impl Loop {
         let skips = self.skips;
         self.rays_in.extend(batch.iter().map(|f| f.bounded(skips)));
         self.hits.resize(batch.len(), Hit::miss(0.0));
-        self.tracer.closest(resident.forest(), &self.rays_in, &mut self.hits);
+        if batch.iter().all(|f| f.ray.key.vertex == 0) {
+            self.tracer.closest_coherent(resident.forest(), &self.rays_in, &mut self.hits);
+        } else {
+            self.tracer.closest(resident.forest(), &self.rays_in, &mut self.hits);
+        }
         let mut beaten = 0;
         for (flight, hit) in batch.iter_mut().zip(&mut self.hits) {
             if !hit.is_hit() {

@@ -117,9 +117,18 @@ fn check_all(forests: &[Forest], triangles: &[Triangle], spheres: &[Sphere], ray
                 tracer.set_sorting(is_sorted);
                 let hits = closest(&mut tracer, forest, rays);
                 let occluded = any(&mut tracer, forest, rays);
+                // a new tracer takes rays together, whatever came before
+                let mut fresh = Tracer::new(tracer.kernel()).unwrap();
+                let mut together = vec![Hit::miss(0.0); rays.len()];
+                fresh.closest_coherent(forest, rays, &mut together);
                 for (i, ray) in rays.iter().enumerate() {
                     assert_eq!(identity(forest, &hits[i]), expected[i], "{:?} {ray:?}", tracer.kernel());
+                    assert_eq!(identity(forest, &together[i]), expected[i], "{:?} {ray:?}", tracer.kernel());
                     assert_eq!(occluded[i], hits[i].prim != MISS, "{:?} {ray:?}", tracer.kernel());
+                    if together[i].prim != MISS {
+                        let id = forest.prim_id(together[i].prim) as usize;
+                        check_primitive(forest, &together[i], triangles.get(id), spheres, id, triangles.len());
+                    }
                     if hits[i].prim != MISS {
                         let id = forest.prim_id(hits[i].prim) as usize;
                         check_primitive(forest, &hits[i], triangles.get(id), spheres, id, triangles.len());
@@ -190,6 +199,38 @@ fn few_primitives_give_the_brute_force_answer() {
     }
     let many = forest(&[block(&soup(&mut random, 200, 1.0, 0.1), &[])]);
     assert!(many.few().is_none(), "a tree serves many");
+}
+
+#[test]
+fn coherent_rays_read_a_node_once_for_all() {
+    let mut random = Random::new(42);
+    let triangles = soup(&mut random, 20_000, 1.0, 0.05);
+    let forest = forest(&[block(&triangles, &[])]);
+    let mut camera = |from: [f32; 3], spread: f32| -> Vec<Ray> {
+        let across = 64;
+        let at = |i: usize| (i as f32 + 0.5) / across as f32 * 2.0 - 1.0;
+        let pixels = (0..across * across).flat_map(|p| [[at(p % across), at(p / across)]; 4]);
+        pixels
+            .map(|[x, y]| {
+                let (x, y) = (x + random.signed() * spread, y + random.signed() * spread);
+                Ray { o: from, tmin: 0.0, d: [x * 0.5, y * 0.5, 1.0], tmax: f32::INFINITY }
+            })
+            .collect()
+    };
+    for mut tracer in kernels() {
+        // from outside and from within; then rays that part, which are traced one by one soon
+        for (from, spread) in [([0.0, 0.0, -3.0], 0.01), ([0.1, 0.2, -0.5], 0.01), ([0.1, 0.2, 0.3], 20.0)] {
+            let rays = camera(from, spread);
+            let expected = closest(&mut tracer, &forest, &rays);
+            for _ in 0..3 {
+                let mut hits = vec![Hit::miss(0.0); rays.len()];
+                tracer.closest_coherent(&forest, &rays, &mut hits);
+                for (a, b) in hits.iter().zip(&expected) {
+                    assert_eq!(identity(&forest, a), identity(&forest, b), "{:?}", tracer.kernel());
+                }
+            }
+        }
+    }
 }
 
 #[test]

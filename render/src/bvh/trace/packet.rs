@@ -1,101 +1,19 @@
-//! The vector kernel for few primitives: a packet of rays at a time through all of them, the plain kernel's answers to the bit.
+//! Packets: rays that go through a scene together, one in each lane, with the plain kernel's answers to the bit.
 //!
-//! Rays are gathered by the axis of their largest component, so that what they have in common with a triangle needs no choice by
-//! lane. A packet goes through the boxes of all leaves and tests what lies in those that any of its rays enters: no stack, no
-//! branch by ray, and an answer is the same whatever rays share its packet.
-#![allow(unsafe_code)] // intrinsics, and packets of numbers of rays that the caller has
+//! Rays are dealt by the axis of their largest component, so that what they have in common with a triangle needs no choice by lane. An
+//! answer is the same whatever rays share its packet.
+#![allow(unsafe_code)] // intrinsics: functions are inlined into entries that enable the features
 
-use super::super::few::{Along, Ball, Few};
-use super::super::forest::Forest;
+use super::super::Sphere;
 use super::super::layout::{Aabb, MAX_COORDINATE};
+use super::Kernel;
 use super::setup::{DIRECTION_RANGE, NO_DIRECTION, PAD};
 use super::triangle::{SMALL_AREA, barycentrics_of_small};
 use super::width::{Eight, Sixteen, Width};
-use super::{Counters, Kernel, runs};
-use crate::ray::{Hit, Ray};
+use crate::ray::Ray;
 
 /// Rays of the largest packet.
-const MOST: usize = 16;
-
-/// What a packet's rays hit.
-#[repr(C, align(64))]
-struct Answers {
-    t: [f32; MOST],
-    u: [f32; MOST],
-    v: [f32; MOST],
-    /// Ranks of what is hit, infinite where nothing is.
-    rank: [f32; MOST],
-    /// Boxes entered by rays that count.
-    entered: u64,
-}
-
-/// Traces rays through a forest's few primitives and tells `done` each ray's number and hit; with `ANY`, only whether there is a hit.
-///
-/// # Panics
-/// When the kernel is none of vectors or the processor cannot run it.
-pub(super) fn trace<const ANY: bool>(
-    kernel: Kernel,
-    forest: &Forest,
-    few: &Few,
-    rays: &[Ray],
-    done: &mut impl FnMut(usize, Hit),
-    counters: &mut Counters,
-) {
-    assert!(runs(kernel));
-    let lanes = lanes(kernel).expect("a kernel of vectors");
-    let (mut waiting, mut counts) = ([[0u32; MOST]; 3], [0; 3]);
-    let mut answers = Answers { t: [0.0; MOST], u: [0.0; MOST], v: [0.0; MOST], rank: [0.0; MOST], entered: 0 };
-    let mut packet = |numbers: &mut [u32; MOST], axis: usize, count: usize| {
-        // those beyond the count are traced with the others, for nothing
-        let last = numbers[count - 1];
-        numbers[count..].fill(last);
-        let scene = Scene { few, largest: forest.largest(), axis };
-        match kernel {
-            // SAFETY: the processor has the features, and all numbers are of rays.
-            Kernel::Avx512 => unsafe { avx512::<ANY>(&scene, rays, numbers, count, &mut answers) },
-            // SAFETY: as above.
-            Kernel::Avx2 => unsafe { avx2::<ANY>(&scene, rays, numbers, count, &mut answers) },
-            Kernel::Auto | Kernel::Scalar => unreachable!("no vector kernel"),
-        }
-        for (i, &number) in numbers[..count].iter().enumerate() {
-            let ray = number as usize;
-            let rank = answers.rank[i];
-            done(
-                ray,
-                if rank == f32::INFINITY {
-                    Hit::miss(rays[ray].tmax)
-                } else {
-                    let place = few.places[rank as usize];
-                    Hit {
-                        t: answers.t[i],
-                        u: answers.u[i],
-                        v: answers.v[i],
-                        prim: place.slot,
-                        leaf: place.leaf,
-                        lane: place.lane,
-                    }
-                },
-            );
-        }
-    };
-    for (i, ray) in rays.iter().enumerate() {
-        let axis = steepest(ray.d);
-        waiting[axis][counts[axis]] = i as u32;
-        counts[axis] += 1;
-        if counts[axis] == lanes {
-            counts[axis] = 0;
-            packet(&mut waiting[axis], axis, lanes);
-        }
-    }
-    for axis in 0..3 {
-        if counts[axis] > 0 {
-            packet(&mut waiting[axis], axis, counts[axis]);
-        }
-    }
-    // a list of boxes is what a node is
-    counters.nodes += rays.len() as u64;
-    counters.leaves += answers.entered;
-}
+pub(super) const MOST: usize = 16;
 
 /// Rays of a kernel's packet, if it has packets.
 pub(super) fn lanes(kernel: Kernel) -> Option<usize> {
@@ -103,6 +21,28 @@ pub(super) fn lanes(kernel: Kernel) -> Option<usize> {
         Kernel::Avx512 => Some(Sixteen::LANES),
         Kernel::Avx2 => Some(Eight::LANES),
         Kernel::Auto | Kernel::Scalar => None,
+    }
+}
+
+/// Deals rays into packets and calls `packet` with the numbers of each one's rays, their axis and how many they are; numbers beyond are
+/// those of one of these rays.
+pub(super) fn deal(lanes: usize, rays: &[Ray], mut packet: impl FnMut(&[u32; MOST], usize, usize)) {
+    let (mut waiting, mut counts) = ([[0u32; MOST]; 3], [0; 3]);
+    for (i, ray) in rays.iter().enumerate() {
+        let axis = steepest(ray.d);
+        waiting[axis][counts[axis]] = i as u32;
+        counts[axis] += 1;
+        if counts[axis] == lanes {
+            counts[axis] = 0;
+            packet(&waiting[axis], axis, lanes);
+        }
+    }
+    for (axis, &count) in counts.iter().enumerate() {
+        if count > 0 {
+            let last = waiting[axis][count - 1];
+            waiting[axis][count..].fill(last);
+            packet(&waiting[axis], axis, count);
+        }
     }
 }
 
@@ -115,107 +55,30 @@ fn steepest(d: [f32; 3]) -> usize {
     2 - 2 * usize::from(is_x) - usize::from(is_y)
 }
 
-/// What all packets along an axis have in common.
-struct Scene<'a> {
-    few: &'a Few,
-    /// Largest magnitude of a coordinate.
-    largest: f32,
-    axis: usize,
-}
-
-/// [`through`] with AVX-512.
-///
-/// # Safety
-/// The processor has what is enabled here; the numbers are of rays.
-#[target_feature(enable = "avx2,fma,bmi1,bmi2,popcnt,lzcnt,avx512f,avx512vl,avx512dq,avx512bw")]
-unsafe fn avx512<const ANY: bool>(
-    scene: &Scene,
-    rays: &[Ray],
-    numbers: &[u32; MOST],
-    count: usize,
-    answers: &mut Answers,
-) {
-    // SAFETY: the features are enabled.
-    unsafe { through::<Sixteen, ANY>(scene, rays, numbers, count, answers) }
-}
-
-/// [`through`] with AVX2.
-///
-/// # Safety
-/// The processor has what is enabled here; the numbers are of rays.
-#[target_feature(enable = "avx2,fma,bmi1,bmi2,popcnt,lzcnt")]
-unsafe fn avx2<const ANY: bool>(
-    scene: &Scene,
-    rays: &[Ray],
-    numbers: &[u32; MOST],
-    count: usize,
-    answers: &mut Answers,
-) {
-    // SAFETY: the features are enabled.
-    unsafe { through::<Eight, ANY>(scene, rays, numbers, count, answers) }
-}
-
-/// Takes a packet through everything.
-///
-/// # Safety
-/// Features of `W` are enabled; the first [`Width::LANES`] numbers are of rays.
-#[inline(always)]
-unsafe fn through<W: Width, const ANY: bool>(
-    scene: &Scene,
-    rays: &[Ray],
-    numbers: &[u32; MOST],
-    count: usize,
-    answers: &mut Answers,
-) {
-    // SAFETY: the features are enabled, numbers and answers have a place for each lane, and a group ends among the triangles.
-    unsafe {
-        let few = scene.few;
-        let mut p = Packet::<W>::start(W::columns(rays.as_ptr(), numbers.as_ptr()), scene.largest, scene.axis);
-        let live = (1u32 << count) - 1;
-        let triangles = few.along[scene.axis].as_ptr();
-        let mut first = 0;
-        for group in &few.groups {
-            let entered = p.enters(&group.bounds);
-            let bits = W::bits(entered);
-            if bits != 0 {
-                answers.entered += u64::from((bits & live).count_ones());
-                for i in first..group.end {
-                    p.triangle::<ANY>(entered, &*triangles.add(i));
-                }
-            }
-            first = group.end;
-        }
-        for ball in &few.balls {
-            let entered = p.enters(&ball.bounds);
-            let bits = W::bits(entered);
-            if bits != 0 {
-                answers.entered += u64::from((bits & live).count_ones());
-                p.ball::<ANY>(entered, ball);
-            }
-        }
-        W::store(answers.t.as_mut_ptr(), p.tmax);
-        W::store(answers.u.as_mut_ptr(), p.u);
-        W::store(answers.v.as_mut_ptr(), p.v);
-        W::store(answers.rank.as_mut_ptr(), p.rank);
-    }
+/// Where rays meet a primitive, whether that counts or not.
+pub(super) struct Crossing<W: Width> {
+    /// Which rays do.
+    pub mask: W::Mask,
+    /// Ray parameter.
+    pub t: W::F,
+    /// Barycentrics of the second and third vertex.
+    pub uv: [W::F; 2],
 }
 
 /// Rays along one axis, one in each lane. What they are is in [`super::setup::State`]; axes stand in their own order for boxes and in
 /// that of the rays for triangles.
-struct Packet<W: Width> {
+pub(super) struct Packet<W: Width> {
     inverse: [W::F; 3],
     near: [W::F; 3],
     far: [W::F; 3],
     is_negative: [W::Mask; 3],
     origin: [W::F; 3],
     shear: [W::F; 3],
-    tmin: W::F,
+    pub tmin: W::F,
     /// The rays' limits, then their best hits.
-    tmax: W::F,
-    u: W::F,
-    v: W::F,
-    /// Of the best hit, infinite where there is none.
-    rank: W::F,
+    pub tmax: W::F,
+    /// Barycentrics of the best hits.
+    pub uv: [W::F; 2],
     /// Origin and direction as they were given.
     o: [W::F; 3],
     d: [W::F; 3],
@@ -227,7 +90,7 @@ impl<W: Width> Packet<W> {
     /// # Safety
     /// Features of `W` are enabled.
     #[inline(always)]
-    unsafe fn start(columns: [W::F; 8], largest: f32, axis: usize) -> Packet<W> {
+    pub unsafe fn start(columns: [W::F; 8], largest: f32, axis: usize) -> Packet<W> {
         // SAFETY: the features are enabled.
         unsafe {
             let [ox, oy, oz, tmin, dx, dy, dz, tmax] = columns;
@@ -274,21 +137,19 @@ impl<W: Width> Packet<W> {
                 // zeros are its second operand
                 tmin: W::max(tmin, zero),
                 tmax: W::select(is_sane, tmax, W::all(-1.0)),
-                u: zero,
-                v: zero,
-                rank: W::all(f32::INFINITY),
+                uv: [zero; 2],
                 o,
                 d,
             }
         }
     }
 
-    /// Which rays enter a box before their best hit. Conservative: see [`super::setup`].
+    /// Which rays enter a box before their best hit, and where. Conservative: see [`super::setup`].
     ///
     /// # Safety
     /// Features of `W` are enabled.
     #[inline(always)]
-    unsafe fn enters(&self, b: &Aabb) -> W::Mask {
+    pub unsafe fn enters(&self, b: &Aabb) -> (W::Mask, W::F) {
         // SAFETY: the features are enabled.
         unsafe {
             let (mut first, mut last) = (self.tmin, self.tmax);
@@ -301,19 +162,19 @@ impl<W: Width> Packet<W> {
                 last = W::min(W::fmsub(exit, self.inverse[a], self.far[a]), last);
                 a += 1;
             }
-            W::le(first, last)
+            (W::le(first, last), first)
         }
     }
 
-    /// Tests a triangle as [`super::triangle::intersect`] does, for the rays that have entered its box.
+    /// Tests a triangle as [`super::triangle::intersect`] does, but for the limits: which of `entered` pass inside, t and the barycentrics of
+    /// the second and third vertex. Vertices stand in the order of the rays' axes.
     ///
     /// # Safety
     /// Features of `W` are enabled.
     #[inline(always)]
-    unsafe fn triangle<const ANY: bool>(&mut self, entered: W::Mask, triangle: &Along) {
+    pub unsafe fn triangle(&self, entered: W::Mask, [a, b, c]: &[[f32; 3]; 3]) -> Option<Crossing<W>> {
         // SAFETY: the features are enabled.
         unsafe {
-            let [a, b, c] = &triangle.vertices;
             let ([ax, ay, az], [bx, by, bz], [cx, cy, cz]) = (self.sheared(a), self.sheared(b), self.sheared(c));
             let (u, v, w) = (edge::<W>(cx, cy, bx, by), edge::<W>(ax, ay, cx, cy), edge::<W>(bx, by, ax, ay));
             let zero = W::all(0.0);
@@ -321,7 +182,7 @@ impl<W: Width> Packet<W> {
             let most = W::max(W::max(u, v), w);
             let inside = W::and(W::or(W::le(zero, least), W::le(most, zero)), entered);
             if W::bits(inside) == 0 {
-                return;
+                return None;
             }
             let sum = W::add(W::add(u, v), w);
             let scale = W::div(W::all(1.0), sum);
@@ -340,7 +201,7 @@ impl<W: Width> Packet<W> {
             }
             let [bu, bv, bw] = barycentrics;
             let t = W::mul(W::fmadd(bu, az, W::fmadd(bv, bz, W::mul(bw, cz))), self.shear[2]);
-            self.accept::<ANY>(inside, t, bv, bw, triangle.rank);
+            Some(Crossing { mask: inside, t, uv: [bv, bw] })
         }
     }
 
@@ -360,21 +221,20 @@ impl<W: Width> Packet<W> {
         }
     }
 
-    /// Tests a sphere as [`super::sphere::intersect`] does, for the rays that have entered its box: sums from left to right, and no
-    /// fused operations. A nearer hit that is too near gives way to the farther one; where it is too far, the other is farther.
+    /// Tests a sphere as [`super::sphere::intersect`] does, but for the limits: which of `entered` meet it, and where. Sums from left to
+    /// right, and no fused operations. A nearer hit that is too near gives way to the farther one; where it is too far, the other is farther.
     ///
     /// # Safety
     /// Features of `W` are enabled.
     #[inline(always)]
-    unsafe fn ball<const ANY: bool>(&mut self, entered: W::Mask, ball: &Ball) {
+    pub unsafe fn sphere(&self, entered: W::Mask, sphere: &Sphere) -> Option<Crossing<W>> {
         // SAFETY: the features are enabled.
         unsafe {
-            let zero = W::all_wide(0.0);
             let d = [W::widen(self.d[0]), W::widen(self.d[1]), W::widen(self.d[2])];
             let mut l = d;
             let mut a = 0;
             while a < 3 {
-                l[a] = W::sub_wide(W::widen(self.o[a]), W::all_wide(f64::from(ball.sphere.center[a])));
+                l[a] = W::sub_wide(W::widen(self.o[a]), W::all_wide(f64::from(sphere.center[a])));
                 a += 1;
             }
             let dd = dot::<W>(d, d);
@@ -385,41 +245,31 @@ impl<W: Width> Packet<W> {
                 foot[a] = W::add_wide(l[a], W::mul_wide(middle, d[a]));
                 a += 1;
             }
-            let r = f64::from(ball.sphere.radius);
+            let r = f64::from(sphere.radius);
             let inside = W::sub_wide(W::all_wide(r * r), dot::<W>(foot, foot));
-            let meets = W::and(W::le_wide(zero, inside), entered);
-            if W::bits(meets) == 0 {
-                return;
+            let mask = W::and(W::le_wide(W::all_wide(0.0), inside), entered);
+            if W::bits(mask) == 0 {
+                return None;
             }
             // NaN where the ray passes by
             let half = W::sqrt_wide(W::div_wide(inside, dd));
             let near = W::narrow(W::sub_wide(middle, half));
             let far = W::narrow(W::add_wide(middle, half));
             let t = W::select(W::lt(self.tmin, near), near, far);
-            self.accept::<ANY>(meets, t, W::all(0.0), W::all(0.0), ball.rank);
+            Some(Crossing { mask, t, uv: [W::all(0.0); 2] })
         }
     }
 
-    /// Takes hits with `tmin < t <= tmax` where they are nearer than the best so far or, at the same distance, of a lesser rank. With
-    /// `ANY` the rays that have one are done.
+    /// Takes hits.
     ///
     /// # Safety
     /// Features of `W` are enabled.
     #[inline(always)]
-    unsafe fn accept<const ANY: bool>(&mut self, mask: W::Mask, t: W::F, u: W::F, v: W::F, rank: f32) {
+    pub unsafe fn accept(&mut self, hits: W::Mask, at: &Crossing<W>) {
         // SAFETY: the features are enabled.
         unsafe {
-            let rank = W::all(rank);
-            let is_less = W::or(W::lt(t, self.tmax), W::and(W::eq(t, self.tmax), W::lt(rank, self.rank)));
-            let hits = W::and(W::and(W::lt(self.tmin, t), is_less), mask);
-            self.rank = W::select(hits, rank, self.rank);
-            if ANY {
-                self.tmax = W::select(hits, W::all(-1.0), self.tmax);
-                return;
-            }
-            self.tmax = W::select(hits, t, self.tmax);
-            self.u = W::select(hits, u, self.u);
-            self.v = W::select(hits, v, self.v);
+            self.tmax = W::select(hits, at.t, self.tmax);
+            self.uv = [W::select(hits, at.uv[0], self.uv[0]), W::select(hits, at.uv[1], self.uv[1])];
         }
     }
 }

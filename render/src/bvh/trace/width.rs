@@ -49,6 +49,10 @@ pub(super) trait Width {
     unsafe fn or(a: Self::Mask, b: Self::Mask) -> Self::Mask;
     /// The mask as bits, that of the first lane lowest.
     unsafe fn bits(mask: Self::Mask) -> u32;
+    /// The mask of such bits.
+    unsafe fn of_bits(bits: u32) -> Self::Mask;
+    /// The least value where the mask holds, infinite if it holds nowhere.
+    unsafe fn least(mask: Self::Mask, x: Self::F) -> f32;
 
     unsafe fn all_wide(x: f64) -> Self::D;
     unsafe fn widen(x: Self::F) -> Self::D;
@@ -144,6 +148,25 @@ impl Width for Eight {
     unsafe fn bits(mask: __m256) -> u32 {
         // SAFETY: the caller's.
         unsafe { _mm256_movemask_ps(mask) as u32 }
+    }
+    #[inline(always)]
+    unsafe fn of_bits(bits: u32) -> __m256 {
+        // SAFETY: the caller's.
+        unsafe {
+            let each = _mm256_setr_epi32(1, 2, 4, 8, 16, 32, 64, 128);
+            let set = _mm256_and_si256(_mm256_set1_epi32(bits as i32), each);
+            _mm256_castsi256_ps(_mm256_cmpeq_epi32(set, each))
+        }
+    }
+    #[inline(always)]
+    unsafe fn least(mask: __m256, x: __m256) -> f32 {
+        // SAFETY: the caller's.
+        unsafe {
+            let x = _mm256_blendv_ps(_mm256_set1_ps(f32::INFINITY), x, mask);
+            let four = _mm_min_ps(_mm256_castps256_ps128(x), _mm256_extractf128_ps::<1>(x));
+            let two = _mm_min_ps(four, _mm_movehl_ps(four, four));
+            _mm_cvtss_f32(_mm_min_ss(two, _mm_shuffle_ps::<1>(two, two)))
+        }
     }
     #[inline(always)]
     unsafe fn all_wide(x: f64) -> [__m256d; 2] {
@@ -245,6 +268,15 @@ impl Width for Sixteen {
     #[inline(always)]
     unsafe fn bits(mask: __mmask16) -> u32 {
         u32::from(mask)
+    }
+    #[inline(always)]
+    unsafe fn of_bits(bits: u32) -> __mmask16 {
+        bits as __mmask16
+    }
+    #[inline(always)]
+    unsafe fn least(mask: __mmask16, x: __m512) -> f32 {
+        // SAFETY: the caller's.
+        unsafe { _mm512_reduce_min_ps(_mm512_mask_blend_ps(mask, _mm512_set1_ps(f32::INFINITY), x)) }
     }
     #[inline(always)]
     unsafe fn all_wide(x: f64) -> [__m512d; 2] {
