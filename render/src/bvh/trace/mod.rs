@@ -1,4 +1,7 @@
 //! Tracing batches of rays through a forest: nearest hit, or whether there is any.
+//!
+//! All ways give the same bits. [`scalar`] is the plain one. With vectors, [`lists`] takes a forest of few primitives, [`coherent`] a camera's rays
+//! (both in packets, a ray in each lane: [`packet`]), [`wide`] all others: many rays in flight, eight boxes or triangles of one ray at a time.
 
 #[cfg(all(target_arch = "x86_64", not(feature = "double")))]
 mod coherent;
