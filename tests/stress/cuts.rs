@@ -127,6 +127,8 @@ fn answers_do_not_depend_on_how_the_scene_is_cut() {
             for tracer in &mut kernels {
                 let hits = closest(tracer, &forest, &rays);
                 let occluded = any(tracer, &forest, &rays);
+                let packets = together(tracer.kernel(), &forest, &rays);
+                assert!(hits.iter().zip(&packets).all(|(a, b)| answer(&forest, a) == answer(&forest, b)), "packets");
                 for (((ray, hit), is_any), expected) in rays.iter().zip(&hits).zip(occluded).zip(&expected) {
                     let kernel = tracer.kernel();
                     assert_eq!(answer(&forest, hit), *expected, "{kernel:?}, {n} blocks, scale {scale}: {ray:?}");

@@ -164,12 +164,14 @@ fn rays_within_a_face_still_meet_what_is_beyond() {
     println!("{traced} rays, none got out");
 }
 
-/// Traces rays, of a test of `total`, in every kernel, closest and any; how many were traced. None may get out.
+/// Traces rays, of a test of `total`, in every kernel, closest (in packets too, which say the same) and any; how many were traced. None may get out.
 fn must_hit(what: &str, forest: &Forest, all: &[Ray], total: u64) -> u64 {
     for tracer in &mut kernels() {
         let rays = if tracer.kernel() == Kernel::Scalar { &all[..plain_share(total, all.len())] } else { all };
         let hits = closest(tracer, forest, rays);
         let occluded = any(tracer, forest, rays);
+        let together = together(tracer.kernel(), forest, rays);
+        assert!(hits.iter().zip(&together).all(|(a, b)| answer(forest, a) == answer(forest, b)), "{what}: packets");
         let out = hits.iter().zip(&occluded).filter(|(hit, any)| !hit.is_hit() || !**any).count();
         let first = rays.iter().zip(&hits).find(|(_, hit)| !hit.is_hit());
         assert!(out == 0, "{:?} {what}: {out} of {} rays got out, first {first:?}", tracer.kernel(), rays.len());

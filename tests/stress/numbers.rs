@@ -65,6 +65,14 @@ pub fn closest(tracer: &mut Tracer, forest: &Forest, rays: &[Ray]) -> Vec<Hit> {
     hits
 }
 
+/// Nearest hits by packets of rays, whether they stay together or not.
+pub fn together(kernel: Kernel, forest: &Forest, rays: &[Ray]) -> Vec<Hit> {
+    let mut hits = vec![Hit::miss(0.0); rays.len()];
+    // a new tracer tries it first
+    Tracer::new(kernel).expect("a kernel that runs").closest_coherent(forest, rays, &mut hits);
+    hits
+}
+
 /// Whether there is any hit.
 pub fn any(tracer: &mut Tracer, forest: &Forest, rays: &[Ray]) -> Vec<bool> {
     let mut occluded = vec![false; rays.len()];

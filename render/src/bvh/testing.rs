@@ -75,6 +75,14 @@ pub(super) fn closest(tracer: &mut Tracer, forest: &Forest, rays: &[Ray]) -> Vec
     hits
 }
 
+/// Nearest hits by a kernel's packets, whether the rays stay together or not.
+pub(super) fn together(kernel: Kernel, forest: &Forest, rays: &[Ray]) -> Vec<Hit> {
+    let mut hits = vec![Hit::miss(0.0); rays.len()];
+    // a new tracer tries it first
+    Tracer::new(kernel).unwrap().closest_coherent(forest, rays, &mut hits);
+    hits
+}
+
 /// Whether there is any hit, by a kernel.
 pub(super) fn any(tracer: &mut Tracer, forest: &Forest, rays: &[Ray]) -> Vec<bool> {
     let mut occluded = vec![false; rays.len()];

@@ -61,14 +61,16 @@ fn ray(random: &mut Random, triangles: &[Triangle], is_sphere: bool) -> Ray {
     Ray { o, tmin: 0.0, d, tmax: f32::INFINITY }
 }
 
-/// 10^5 rays at each mesh of 120,000 triangles; with RAYHERD_LEAK_RAYS=10000000 as many at meshes of 1,080,000.
+/// 10^5 rays at each mesh of 12, 48 and 120,000 triangles; with RAYHERD_LEAK_RAYS=10000000 as many at meshes of 12, 48 and 1,080,000.
 #[test]
 fn closed_meshes_do_not_leak() {
     let (total, side) = match std::env::var("RAYHERD_LEAK_RAYS") {
         Ok(n) => (n.parse().expect("RAYHERD_LEAK_RAYS is a number of rays"), 300),
         Err(_) => (100_000, 100),
     };
-    for is_sphere in [true, false] {
+    // the first two without a tree
+    let meshes = [1, 2, side].into_iter().flat_map(|side| [(side, true), (side, false)]);
+    for (side, is_sphere) in meshes {
         let triangles = mesh(side, is_sphere);
         let forest = forest(&[block(&triangles, &[])]);
         for mut tracer in kernels() {
@@ -82,6 +84,9 @@ fn closed_meshes_do_not_leak() {
                 let rays: Vec<Ray> = (0..n).map(|_| ray(&mut random, &triangles, is_sphere)).collect();
                 for (ray, hit) in rays.iter().zip(closest(&mut tracer, &forest, &rays)) {
                     assert!(hit.is_hit(), "{:?} {ray:?}", tracer.kernel());
+                }
+                for (ray, hit) in rays.iter().zip(together(tracer.kernel(), &forest, &rays)) {
+                    assert!(hit.is_hit(), "{:?} together {ray:?}", tracer.kernel());
                 }
                 for (ray, is_hit) in rays.iter().zip(any(&mut tracer, &forest, &rays)) {
                     assert!(is_hit, "{:?} any {ray:?}", tracer.kernel());

@@ -117,10 +117,7 @@ fn check_all(forests: &[Forest], triangles: &[Triangle], spheres: &[Sphere], ray
                 tracer.set_sorting(is_sorted);
                 let hits = closest(&mut tracer, forest, rays);
                 let occluded = any(&mut tracer, forest, rays);
-                // a new tracer takes rays together, whatever came before
-                let mut fresh = Tracer::new(tracer.kernel()).unwrap();
-                let mut together = vec![Hit::miss(0.0); rays.len()];
-                fresh.closest_coherent(forest, rays, &mut together);
+                let together = together(tracer.kernel(), forest, rays);
                 for (i, ray) in rays.iter().enumerate() {
                     assert_eq!(identity(forest, &hits[i]), expected[i], "{:?} {ray:?}", tracer.kernel());
                     assert_eq!(identity(forest, &together[i]), expected[i], "{:?} {ray:?}", tracer.kernel());

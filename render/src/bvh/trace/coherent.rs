@@ -155,8 +155,11 @@ unsafe fn through<W: Width>(of: &Batch, stack: &mut Vec<Entry>, answers: &mut An
                     let bits = W::bits(mask);
                     if bits != 0 {
                         let record = arena.add(offset(child));
+                        // all of it: nothing else is done while a packet waits
                         prefetch(&*record);
                         prefetch(&*record.add(64));
+                        prefetch(&*record.add(128));
+                        prefetch(&*record.add(192));
                         stack.push(Entry { distance: W::least(mask, distance), reference: child, entered: bits });
                     }
                 }
