@@ -87,6 +87,9 @@ struct Together {
 /// visits by single rays, whose ways overlap.
 #[cfg(all(target_arch = "x86_64", not(feature = "double")))]
 const TOGETHER: f64 = 4.0;
+/// Rays of a batch from which on it tells whether rays stay together.
+#[cfg(all(target_arch = "x86_64", not(feature = "double")))]
+const TOLD: usize = 8 * packet::MOST;
 /// Batches after which rays that parted are tried together again.
 #[cfg(all(target_arch = "x86_64", not(feature = "double")))]
 const APART: u32 = 31;
@@ -156,7 +159,8 @@ impl Tracer {
                 for (rays, hits) in rays.chunks(MAX_BATCH).zip(hits.chunks_mut(MAX_BATCH)) {
                     let done = &mut |i: usize, hit| hits[i] = hit;
                     let entered = coherent::trace(self.kernel, forest, rays, done, stack, &mut self.counters);
-                    *apart = if entered < TOGETHER { APART } else { 0 };
+                    // packets that are not full tell little
+                    *apart = if rays.len() >= TOLD && entered < TOGETHER { APART } else { 0 };
                 }
                 return;
             }
