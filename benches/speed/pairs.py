@@ -36,6 +36,8 @@ def main() -> None:
     p.add_argument("--max-depth", type=int, default=8)
     a = p.parse_args()
     a.work.mkdir(parents=True, exist_ok=True)
+    # now, not after an hour of measuring
+    a.results.mkdir(parents=True, exist_ok=True)
     machine = next((l.split(":")[1].strip() for l in open("/proc/cpuinfo") if l.startswith("model name")), platform.machine())
     out = a.results / f"{datetime.date.today()}-{machine.replace(' ', '-')}-speed.csv"
     rows = []
