@@ -263,6 +263,7 @@ impl Loop {
         let skips = self.skips;
         self.rays_in.extend(batch.iter().map(|f| f.bounded(skips)));
         self.hits.resize(batch.len(), Hit::miss(0.0));
+        // a camera's come in batches of their own
         if batch.iter().all(|f| f.ray.key.vertex == 0) {
             self.tracer.closest_coherent(resident.forest(), &self.rays_in, &mut self.hits);
         } else {

@@ -81,16 +81,14 @@ impl Few {
         let sphere_leaves = spheres.map_or(Some(Vec::new()), |root| leaves(arena, root, MOST_SPHERES))?;
 
         let all = triangle_leaves.iter().chain(&sphere_leaves).flat_map(|&(_, leaf)| {
-            let n = leaf_len(leaf);
-            let slot = move |i| read_u32(arena, offset(leaf) + (INDEX_ROW * n + i) * 4);
-            (0..n).map(move |i| Place { slot: slot(i), leaf, lane: i as u32 })
+            (0..leaf_len(leaf)).map(move |i| Place { slot: read_index(arena, leaf, i), leaf, lane: i as u32 })
         });
         let mut places: Vec<(PrimId, Place)> = all.map(|place| (forest.prim_id(place.slot), place)).collect();
         places.sort_by_key(|(id, place)| (*id, place.slot));
         // a triangle may stand in several leaves: any of them will do
         places.dedup_by_key(|(_, place)| place.slot);
         let rank = |leaf: u32, i: usize| {
-            let slot = read_u32(arena, offset(leaf) + (INDEX_ROW * leaf_len(leaf) + i) * 4);
+            let slot = read_index(arena, leaf, i);
             places.iter().position(|(_, place)| place.slot == slot).expect("every slot has its place") as f32
         };
 

@@ -134,6 +134,11 @@ impl Aabb {
     }
 }
 
+/// Index of the i-th primitive of the leaf that a reference points to.
+#[inline(always)]
+pub(super) fn read_index(bytes: &[u8], leaf: u32, i: usize) -> u32 {
+    read_u32(bytes, offset(leaf) + (INDEX_ROW * leaf_len(leaf) + i) * 4)
+}
 /// Box and reference of a node's slot.
 pub(super) fn read_slot(bytes: &[u8], node: usize, slot: usize) -> (Aabb, u32) {
     let row = |r: usize| read_f32(bytes, node + r * 32 + slot * 4);

@@ -7,7 +7,7 @@
 
 use super::super::forest::Forest;
 use super::super::layout::*;
-use super::packet::{MOST, Packet, deal, lanes};
+use super::packet::{MOST, Members, Packet, deal};
 use super::width::{Eight, Sixteen, Width};
 use super::{Counters, Kernel, runs};
 use crate::memory::prefetch;
@@ -54,23 +54,23 @@ pub(super) fn trace(
     assert!(runs(kernel));
     let zero = [0.0; MOST];
     let mut answers = Answers { t: zero, uv: [zero; 2], leaf: zero, lane: zero, entered: [0; 2], visits: 0 };
-    deal(lanes(kernel).expect("a kernel of vectors"), rays, |numbers, axis, count| {
-        let of = Batch { forest, rays, numbers, axis, count };
+    deal(kernel, forest, rays, |of| {
         match kernel {
             // SAFETY: the processor has the features, and all numbers are of rays.
-            Kernel::Avx512 => unsafe { avx512(&of, stack, &mut answers) },
+            Kernel::Avx512 => unsafe { avx512(of, stack, &mut answers) },
             // SAFETY: as above.
-            Kernel::Avx2 => unsafe { avx2(&of, stack, &mut answers) },
+            Kernel::Avx2 => unsafe { avx2(of, stack, &mut answers) },
             Kernel::Auto | Kernel::Scalar => unreachable!("no vector kernel"),
         }
-        for (i, &number) in numbers[..count].iter().enumerate() {
+        for (i, &number) in of.numbers[..of.count].iter().enumerate() {
             let (ray, leaf, lane) = (number as usize, answers.leaf[i].to_bits(), answers.lane[i] as u32);
             if leaf == 0 {
                 done(ray, Hit::miss(rays[ray].tmax));
                 continue;
             }
             let [u, v] = [answers.uv[0][i], answers.uv[1][i]];
-            done(ray, Hit { t: answers.t[i], u, v, prim: slot(forest, leaf, lane), leaf, lane });
+            let prim = read_index(forest.arena(), leaf, lane as usize);
+            done(ray, Hit { t: answers.t[i], u, v, prim, leaf, lane });
         }
     });
     counters.nodes += answers.entered[0];
@@ -78,26 +78,12 @@ pub(super) fn trace(
     answers.entered[0] as f64 / answers.visits.max(1) as f64
 }
 
-/// Slot of a primitive by its place.
-fn slot(forest: &Forest, leaf: u32, lane: u32) -> u32 {
-    read_u32(forest.arena(), offset(leaf) + (INDEX_ROW * leaf_len(leaf) + lane as usize) * 4)
-}
-
-/// A packet's rays.
-struct Batch<'a> {
-    forest: &'a Forest,
-    rays: &'a [Ray],
-    numbers: &'a [u32; MOST],
-    axis: usize,
-    count: usize,
-}
-
 /// [`through`] with AVX-512.
 ///
 /// # Safety
 /// The processor has what is enabled here; the numbers are of rays.
 #[target_feature(enable = "avx2,fma,bmi1,bmi2,popcnt,lzcnt,avx512f,avx512vl,avx512dq,avx512bw")]
-unsafe fn avx512(of: &Batch, stack: &mut Vec<Entry>, answers: &mut Answers) {
+unsafe fn avx512(of: &Members, stack: &mut Vec<Entry>, answers: &mut Answers) {
     // SAFETY: the features are enabled.
     unsafe { through::<Sixteen>(of, stack, answers) }
 }
@@ -107,7 +93,7 @@ unsafe fn avx512(of: &Batch, stack: &mut Vec<Entry>, answers: &mut Answers) {
 /// # Safety
 /// The processor has what is enabled here; the numbers are of rays.
 #[target_feature(enable = "avx2,fma,bmi1,bmi2,popcnt,lzcnt")]
-unsafe fn avx2(of: &Batch, stack: &mut Vec<Entry>, answers: &mut Answers) {
+unsafe fn avx2(of: &Members, stack: &mut Vec<Entry>, answers: &mut Answers) {
     // SAFETY: the features are enabled.
     unsafe { through::<Eight>(of, stack, answers) }
 }
@@ -117,7 +103,7 @@ unsafe fn avx2(of: &Batch, stack: &mut Vec<Entry>, answers: &mut Answers) {
 /// # Safety
 /// Features of `W` are enabled; the first [`Width::LANES`] numbers are of rays.
 #[inline(always)]
-unsafe fn through<W: Width>(of: &Batch, stack: &mut Vec<Entry>, answers: &mut Answers) {
+unsafe fn through<W: Width>(of: &Members, stack: &mut Vec<Entry>, answers: &mut Answers) {
     let arena = of.forest.arena().as_ptr();
     let live = (1u32 << of.count) - 1;
     // SAFETY: the features are enabled; numbers and answers have a place for each lane; references of the forest's trees lead to whole nodes
@@ -191,7 +177,7 @@ unsafe fn through<W: Width>(of: &Batch, stack: &mut Vec<Entry>, answers: &mut An
                     let mut best = [[0.0; MOST]; 2];
                     W::store(best[0].as_mut_ptr(), best_leaf);
                     W::store(best[1].as_mut_ptr(), best_lane);
-                    let here = slot(of.forest, entry.reference, i as u32);
+                    let here = read_index(of.forest.arena(), entry.reference, i);
                     hits = W::or(hits, W::of_bits(preceding(of.forest, ties, here, &best)));
                 }
                 if W::bits(hits) != 0 {
@@ -218,7 +204,7 @@ fn preceding(forest: &Forest, ties: u32, here: u32, best: &[[f32; MOST]; 2]) -> 
         let leaf = best[0][i].to_bits();
         // the same one from another leaf is most of what comes here
         let goes = leaf == 0 || {
-            let there = slot(forest, leaf, best[1][i] as u32);
+            let there = read_index(forest.arena(), leaf, best[1][i] as usize);
             here != there && forest.precedes(here, there)
         };
         out |= u32::from(goes) << i;

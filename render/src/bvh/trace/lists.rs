@@ -4,7 +4,7 @@
 
 use super::super::few::Few;
 use super::super::forest::Forest;
-use super::packet::{Crossing, MOST, Packet, deal, lanes};
+use super::packet::{Crossing, MOST, Members, Packet, deal};
 use super::width::{Eight, Sixteen, Width};
 use super::{Counters, Kernel, runs};
 use crate::ray::{Hit, Ray};
@@ -34,16 +34,15 @@ pub(super) fn trace<const ANY: bool>(
 ) {
     assert!(runs(kernel));
     let mut answers = Answers { t: [0.0; MOST], uv: [[0.0; MOST]; 2], rank: [0.0; MOST], entered: 0 };
-    deal(lanes(kernel).expect("a kernel of vectors"), rays, |numbers, axis, count| {
-        let scene = Scene { few, largest: forest.largest(), axis };
+    deal(kernel, forest, rays, |of| {
         match kernel {
             // SAFETY: the processor has the features, and all numbers are of rays.
-            Kernel::Avx512 => unsafe { avx512::<ANY>(&scene, rays, numbers, count, &mut answers) },
+            Kernel::Avx512 => unsafe { avx512::<ANY>(of, few, &mut answers) },
             // SAFETY: as above.
-            Kernel::Avx2 => unsafe { avx2::<ANY>(&scene, rays, numbers, count, &mut answers) },
+            Kernel::Avx2 => unsafe { avx2::<ANY>(of, few, &mut answers) },
             Kernel::Auto | Kernel::Scalar => unreachable!("no vector kernel"),
         }
-        for (i, &number) in numbers[..count].iter().enumerate() {
+        for (i, &number) in of.numbers[..of.count].iter().enumerate() {
             let ray = number as usize;
             let rank = answers.rank[i];
             if rank == f32::INFINITY {
@@ -59,28 +58,14 @@ pub(super) fn trace<const ANY: bool>(
     counters.leaves += answers.entered;
 }
 
-/// What all packets along an axis have in common.
-struct Scene<'a> {
-    few: &'a Few,
-    /// Largest magnitude of a coordinate.
-    largest: f32,
-    axis: usize,
-}
-
 /// [`through`] with AVX-512.
 ///
 /// # Safety
 /// The processor has what is enabled here; the numbers are of rays.
 #[target_feature(enable = "avx2,fma,bmi1,bmi2,popcnt,lzcnt,avx512f,avx512vl,avx512dq,avx512bw")]
-unsafe fn avx512<const ANY: bool>(
-    scene: &Scene,
-    rays: &[Ray],
-    numbers: &[u32; MOST],
-    count: usize,
-    answers: &mut Answers,
-) {
+unsafe fn avx512<const ANY: bool>(of: &Members, few: &Few, answers: &mut Answers) {
     // SAFETY: the features are enabled.
-    unsafe { through::<Sixteen, ANY>(scene, rays, numbers, count, answers) }
+    unsafe { through::<Sixteen, ANY>(of, few, answers) }
 }
 
 /// [`through`] with AVX2.
@@ -88,15 +73,9 @@ unsafe fn avx512<const ANY: bool>(
 /// # Safety
 /// The processor has what is enabled here; the numbers are of rays.
 #[target_feature(enable = "avx2,fma,bmi1,bmi2,popcnt,lzcnt")]
-unsafe fn avx2<const ANY: bool>(
-    scene: &Scene,
-    rays: &[Ray],
-    numbers: &[u32; MOST],
-    count: usize,
-    answers: &mut Answers,
-) {
+unsafe fn avx2<const ANY: bool>(of: &Members, few: &Few, answers: &mut Answers) {
     // SAFETY: the features are enabled.
-    unsafe { through::<Eight, ANY>(scene, rays, numbers, count, answers) }
+    unsafe { through::<Eight, ANY>(of, few, answers) }
 }
 
 /// Takes a packet through everything.
@@ -104,20 +83,14 @@ unsafe fn avx2<const ANY: bool>(
 /// # Safety
 /// Features of `W` are enabled; the first [`Width::LANES`] numbers are of rays.
 #[inline(always)]
-unsafe fn through<W: Width, const ANY: bool>(
-    scene: &Scene,
-    rays: &[Ray],
-    numbers: &[u32; MOST],
-    count: usize,
-    answers: &mut Answers,
-) {
+unsafe fn through<W: Width, const ANY: bool>(of: &Members, few: &Few, answers: &mut Answers) {
     // SAFETY: the features are enabled, numbers and answers have a place for each lane, and a group ends among the triangles.
     unsafe {
-        let few = scene.few;
-        let mut p = Packet::<W>::start(W::columns(rays.as_ptr(), numbers.as_ptr()), scene.largest, scene.axis);
+        let columns = W::columns(of.rays.as_ptr(), of.numbers.as_ptr());
+        let mut p = Packet::<W>::start(columns, of.forest.largest(), of.axis);
         let mut best = W::all(f32::INFINITY);
-        let live = (1u32 << count) - 1;
-        let triangles = few.along[scene.axis].as_ptr();
+        let live = (1u32 << of.count) - 1;
+        let triangles = few.along[of.axis].as_ptr();
         let mut first = 0;
         for group in &few.groups {
             let (entered, _) = p.enters(&group.bounds);

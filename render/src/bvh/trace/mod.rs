@@ -42,7 +42,7 @@ pub enum Kernel {
     Scalar,
     /// AVX2 and FMA.
     Avx2,
-    /// AVX-512 F, VL, DQ, BW; on vectors of 256 bits, but for forests of few primitives.
+    /// AVX-512 F, VL, DQ, BW: packets of rays on vectors of 512 bits, single rays on vectors of 256.
     Avx512,
 }
 

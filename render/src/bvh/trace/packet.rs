@@ -5,6 +5,7 @@
 #![allow(unsafe_code)] // intrinsics: functions are inlined into entries that enable the features
 
 use super::super::Sphere;
+use super::super::forest::Forest;
 use super::super::layout::{Aabb, MAX_COORDINATE};
 use super::Kernel;
 use super::setup::{DIRECTION_RANGE, NO_DIRECTION, PAD};
@@ -24,9 +25,24 @@ pub(super) fn lanes(kernel: Kernel) -> Option<usize> {
     }
 }
 
-/// Deals rays into packets and calls `packet` with the numbers of each one's rays, their axis and how many they are; numbers beyond are
-/// those of one of these rays.
-pub(super) fn deal(lanes: usize, rays: &[Ray], mut packet: impl FnMut(&[u32; MOST], usize, usize)) {
+/// The rays of a packet.
+pub(super) struct Members<'a> {
+    pub forest: &'a Forest,
+    /// Those of which it is made.
+    pub rays: &'a [Ray],
+    /// Which of them it has. Numbers beyond the count are those of one of these.
+    pub numbers: &'a [u32; MOST],
+    /// Of the largest component of their directions.
+    pub axis: usize,
+    pub count: usize,
+}
+
+/// Deals rays into packets and calls `packet` with each.
+///
+/// # Panics
+/// When the kernel has no packets.
+pub(super) fn deal(kernel: Kernel, forest: &Forest, rays: &[Ray], mut packet: impl FnMut(&Members)) {
+    let lanes = lanes(kernel).expect("a kernel of vectors");
     let (mut waiting, mut counts) = ([[0u32; MOST]; 3], [0; 3]);
     for (i, ray) in rays.iter().enumerate() {
         let axis = steepest(ray.d);
@@ -34,14 +50,14 @@ pub(super) fn deal(lanes: usize, rays: &[Ray], mut packet: impl FnMut(&[u32; MOS
         counts[axis] += 1;
         if counts[axis] == lanes {
             counts[axis] = 0;
-            packet(&waiting[axis], axis, lanes);
+            packet(&Members { forest, rays, numbers: &waiting[axis], axis, count: lanes });
         }
     }
     for (axis, &count) in counts.iter().enumerate() {
         if count > 0 {
             let last = waiting[axis][count - 1];
             waiting[axis][count..].fill(last);
-            packet(&waiting[axis], axis, count);
+            packet(&Members { forest, rays, numbers: &waiting[axis], axis, count });
         }
     }
 }

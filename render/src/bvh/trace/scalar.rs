@@ -19,7 +19,7 @@ pub(super) fn triangles(forest: &Forest, state: &mut State, any: bool, stack: &m
         let (at, n) = (offset(leaf), leaf_len(leaf));
         for i in 0..n {
             if let Some(Intersection { t, uv }) = intersect(state, &read_triangle(arena, at, n, i)) {
-                accept(forest, state, t, uv, read_u32(arena, at + (INDEX_ROW * n + i) * 4), leaf, i as u32);
+                accept(forest, state, t, uv, read_index(arena, leaf, i), leaf, i as u32);
             }
         }
         any && state.prim != MISS
@@ -42,7 +42,7 @@ pub(super) fn spheres(
         for i in 0..n {
             let s = read_sphere(arena, at, n, i);
             if let Some(t) = sphere::intersect(ray, state.tmin, state.tmax, s.center.map(real), real(s.radius)) {
-                accept(forest, state, t, [0.0; 2], read_u32(arena, at + (INDEX_ROW * n + i) * 4), leaf, i as u32);
+                accept(forest, state, t, [0.0; 2], read_index(arena, leaf, i), leaf, i as u32);
             }
         }
         any && state.prim != MISS
