@@ -213,6 +213,39 @@ fn triangle_density_is_exact() {
     }
 }
 
+/// The same of a sphere, from outside and from inside; outside it is one over the solid angle of its cone.
+#[test]
+fn sphere_density_is_exact() {
+    let (center, mut rng) = (Vec3::new(0.5, 1.0, -0.5), Rng(6));
+    for (radius, flipped) in [(0.7f32, false), (3.0, true)] {
+        let primitives = [(Primitive::Sphere { center: center.to_array(), radius, flipped }, 0)];
+        let lights = Lights::new(&world(&primitives, &[1.0], None));
+        let (mut compared, all) = (0, 10_000);
+        for _ in 0..all {
+            let away = if flipped { rng.range(0.0, 0.95) } else { rng.range(1.05, 6.0) };
+            let o = center + rng.direction() * (away * radius);
+            let s =
+                lights.sample(o, rng.u32(), [rng.u32(), rng.u32()]).expect("its front is seen from everywhere here");
+            let to = (center - o).as_dvec3();
+            let sin2 = f64::from(radius).powi(2) / to.length_squared();
+            if !flipped {
+                let cone = sin2 / (1.0 + (1.0 - sin2).sqrt());
+                let even = 1.0 / (std::f64::consts::TAU * cone);
+                assert!((f64::from(s.pdf) / even - 1.0).abs() < 1e-5, "{o}: {} {even}", s.pdf);
+                // at the rim rounding decides whether it is met
+                let below = 0.5 * (s.d.as_dvec3().normalize() - to.normalize()).length_squared();
+                if below > cone * (1.0 - 1e-4) {
+                    continue;
+                }
+            }
+            let met = density(&lights, &primitives, o, s.d);
+            assert!((f64::from(s.pdf) / met - 1.0).abs() < 2e-5, "{flipped} {o} {}: {} {met}", s.d, s.pdf);
+            compared += 1;
+        }
+        assert!(compared > all - 100, "{compared}");
+    }
+}
+
 /// Shares: nine tenths by power, a tenth evenly; within a shape by area; behind the light nothing.
 #[test]
 fn choice_is_by_power() {

@@ -2,7 +2,7 @@
 
 use glam::{DVec3, Vec3};
 
-use super::tests::{any_principled, clear_plastic, crossing, follows_density, glass, local, rough, rough_plastic};
+use super::tests::{any_principled, crossing, follows_density, glass, local, rough, rough_plastic};
 use super::*;
 use crate::testing::{Rng, chi_square};
 
@@ -209,6 +209,93 @@ fn narrow_lobes_follow_their_density() {
     assert_eq!(compared, 2 * 5 * (6 * 3 + 4));
 }
 
+/// Wide lobes where a view grazes the surface, bin by bin: most of those that [`samples_follow_the_density_of_any_model`] leaves to the integral are there.
+#[test]
+fn wide_lobes_follow_their_density_at_grazing_angles() {
+    let mut rng = Rng(27);
+    for (kind, name) in KINDS.iter().enumerate() {
+        let (mut compared, all) = (0, 9);
+        for i in 0..all {
+            let (bsdf, front) = (any(kind, &mut rng), i % 3 != 0);
+            let front = front || !bsdf.transmits();
+            let wo = local([1.48, 1.53, 1.56][i as usize % 3], rng.range(-3.1, 3.1));
+            compared += u32::from(follows_density(&bsdf, front, wo, 20_000, 44, &mut rng));
+        }
+        println!("{name}: {compared} of {all} compared bin by bin");
+        assert!(3 * compared >= 2 * all, "{name}: {compared} of {all}");
+    }
+}
+
+/// Phong's lobe up to the largest exponent that is read: (n + 1) / 2 pi cos^n about the mirror's direction. Rings of equal shares.
+#[test]
+fn sharp_phong_follows_its_density() {
+    let mut rng = Rng(28);
+    let (rings, sectors, n) = (12, 8, 100_000);
+    for exponent in [1e3, 1e4, 1e5, 1e6] {
+        for wo in [local(0.0, 0.0), local(0.7, 0.4), local(1.3, -2.0)] {
+            let bsdf = Bsdf::Phong { diffuse: [0.0; 3], specular: [0.8; 3], exponent };
+            let mirror = DVec3::new(-f64::from(wo.x), -f64::from(wo.y), f64::from(wo.z)).normalize();
+            let side = mirror.any_orthonormal_vector();
+            let mut counts = vec![0.0; rings * sectors];
+            for _ in 0..n {
+                let s = bsdf.sample(wo, true, [rng.f32(), rng.f32()], rng.f32()).expect("all of the lobe is above");
+                let d = s.wi.as_dvec3().normalize();
+                // cos without cancellation: what is within it has a share of 1 - cos^(n + 1)
+                let cos_less_1 = -0.5 * (d - mirror).length_squared();
+                let within = -((f64::from(exponent) + 1.0) * cos_less_1.ln_1p()).exp_m1();
+                let turn = d.dot(mirror.cross(side)).atan2(d.dot(side)) / std::f64::consts::TAU + 0.5;
+                let ring = ((within * rings as f64) as usize).min(rings - 1);
+                counts[ring * sectors + ((turn * sectors as f64) as usize).min(sectors - 1)] += 1.0;
+                // value and density are those of a cosine in f32, which is off by some 2^-24: by so many times the exponent in the power
+                let power = (f64::from(exponent) * cos_less_1.ln_1p()).exp();
+                let expected = (f64::from(exponent) + 1.0) / std::f64::consts::TAU * power;
+                let e = bsdf.eval(wo, s.wi, true);
+                let off = (f64::from(e.pdf) / expected).ln().abs();
+                assert!(off < 2f64.powi(-21) * f64::from(exponent) + 1e-4, "{exponent} {wo} {d}: {} {expected}", e.pdf);
+                let weight =
+                    f64::from(e.value.x / e.pdf) / (0.8 * f64::from(exponent + 2.0) / f64::from(exponent + 1.0) * d.z);
+                assert!((weight - 1.0).abs() < 1e-5, "{exponent} {wo} {d}: {weight}");
+            }
+            chi_square(&counts, &vec![f64::from(n) / counts.len() as f64; counts.len()]);
+        }
+    }
+}
+
+/// Any model, in all channels: f(wo, wi) = f(wi, wo), and across an interface that over the square of the index at `wo`.
+#[test]
+fn directions_may_be_exchanged_in_any_model() {
+    let mut rng = Rng(29);
+    let mut exchanged = [[0; 2]; KINDS.len()];
+    for (kind, name) in KINDS.iter().enumerate() {
+        for _ in 0..24 {
+            let bsdf = any(kind, &mut rng);
+            let front = rng.u32() & 1 == 0 || !bsdf.transmits();
+            for _ in 0..400 {
+                let mut up = || {
+                    let d = rng.direction();
+                    Vec3::new(d.x, d.y, d.z.abs().max(1e-3)).normalize()
+                };
+                let (a, b) = (up(), up());
+                let (ab, ba) = (bsdf.eval(a, b, front).value / b.z, bsdf.eval(b, a, front).value / a.z);
+                let close = (ab - ba).abs().cmple(1e-3 * ab.max(ba) + 1e-12).all();
+                assert!(close, "{name}: {bsdf:?} {front} {a} {b}: {ab} {ba}");
+                exchanged[kind][0] += u32::from(ab.max_element() > 0.0);
+                if let Bsdf::RoughDielectric { eta, .. } = bsdf {
+                    let flip = |v: Vec3| Vec3::new(v.x, v.y, -v.z);
+                    let there = bsdf.eval(a, flip(b), front).value / b.z * relative(eta, front).powi(2);
+                    let back = bsdf.eval(b, flip(a), !front).value / a.z;
+                    // near the critical angle cosines, and with them small values, are mostly rounding
+                    let close = (there - back).abs().cmple(1e-2 * there.max(back) + 1e-4).all();
+                    assert!(close, "{name}: {bsdf:?} {front} {a} {b}: {there} {back}");
+                    exchanged[kind][1] += u32::from(there.max_element() > 0.0);
+                }
+            }
+        }
+    }
+    println!("{exchanged:?}");
+    assert!(exchanged.iter().all(|e| e[0] > 4000) && exchanged[2][1] > 1000, "{exchanged:?}");
+}
+
 /// Glass between what is narrow and what a quadrature over directions takes ([`any`]).
 #[test]
 fn rough_glass_between_follows_its_density() {
@@ -216,7 +303,7 @@ fn rough_glass_between_follows_its_density() {
     let mut least = 1.0f64;
     for distribution in [Distribution::Beckmann, Distribution::Ggx] {
         for alpha in [[0.2; 2], [0.3; 2], [0.45; 2], [0.2, 0.4]] {
-            for wo in [local(0.0, 0.0), local(0.5, 0.7), local(1.1, -2.0), local(1.4, 0.3)] {
+            for wo in [local(0.0, 0.0), local(0.5, 0.7), local(1.1, -2.0), local(1.4, 0.3), local(1.48, 2.5)] {
                 let eta = rng.range(1.2, 2.0);
                 for (front, relative) in [(true, f64::from(eta)), (false, 1.0 / f64::from(eta))] {
                     let (glass, slopes) = (glass(distribution, alpha, eta), Slopes::of(alpha, 3.0));
@@ -306,20 +393,22 @@ fn single_directions_have_their_share() {
     }
 }
 
-/// What a white sky is reflected and let through to, by sampling.
-fn albedo(bsdf: &Bsdf, front: bool, wo: Vec3, n: u32, rng: &mut Rng) -> f64 {
-    let mut sum = 0.0;
+/// What a white sky is reflected and let through to, by sampling, and its standard error.
+fn albedo(bsdf: &Bsdf, front: bool, wo: Vec3, n: u32, rng: &mut Rng) -> (f64, f64) {
+    let (mut sum, mut squares) = (0.0, 0.0);
     for _ in 0..n {
         let Some(s) = bsdf.sample(wo, front, [rng.f32(), rng.f32()], rng.f32()) else { continue };
-        sum += match s.delta {
+        let weight = match s.delta {
             Some(w) => f64::from(w.x * crossing(bsdf, front, s.wi)),
             None => {
                 let e = bsdf.eval(wo, s.wi, front);
                 if e.pdf > 0.0 { f64::from(e.value.x / e.pdf * crossing(bsdf, front, s.wi)) } else { 0.0 }
             }
         };
+        (sum, squares) = (sum + weight, squares + weight * weight);
     }
-    sum / f64::from(n)
+    let mean = sum / f64::from(n);
+    (mean, ((squares / f64::from(n) - mean * mean).max(0.0) / f64::from(n)).sqrt())
 }
 
 /// White surfaces of random parameters under a white sky give back no more than comes. `principled` does where it is no metal and no glass: it is Mitsuba's,
@@ -340,8 +429,8 @@ fn no_model_makes_energy() {
             (p.metallic, p.spec_trans) = if rng.u32() & 1 == 0 { (1.0, 0.0) } else { (0.0, 1.0) };
         }
         let front = p.spec_trans == 0.0 || rng.u32() & 1 == 0;
-        let found = albedo(&Bsdf::Principled(p), front, wo, 20_000, &mut rng);
-        most[kind] = most[kind].max(found);
+        let (found, error) = albedo(&Bsdf::Principled(p), front, wo, 20_000, &mut rng);
+        most[kind] = most[kind].max(found - 4.0 * error);
     }
     println!(
         "principled: metal or glass {:.4}, without sheen and coat {:.4}, with all {:.4}",
@@ -349,18 +438,20 @@ fn no_model_makes_energy() {
     );
     for (kind, name) in KINDS.iter().enumerate() {
         let mut most = 0.0f64;
-        for _ in 0..60 {
+        for i in 0..60 {
             let mut bsdf = any(kind, &mut rng);
+            if let (Bsdf::RoughPlastic { distribution, eta, nonlinear, .. }, true) = (&bsdf, i < 24) {
+                bsdf = rough_plastic(*distribution, [1e-3, 0.01, 0.03, 0.1][i % 4], *eta, 1.0, *nonlinear);
+            }
             for slot in [Slot::Diffuse, Slot::Specular, Slot::Transmit] {
                 bsdf.color_mut(slot).into_iter().for_each(|color| *color = [1.0; 3]);
             }
             let front = rng.u32() & 1 == 0 || !bsdf.transmits();
-            most = most.max(albedo(&bsdf, front, any_view(&mut rng), 20_000, &mut rng));
+            let (found, error) = albedo(&bsdf, front, any_view(&mut rng), 20_000, &mut rng);
+            most = most.max(found - 4.0 * error);
         }
         println!("{name}: {most:.4}");
-        assert!(most < 1.02, "{name}: {most}");
+        assert!(most < 1.0 + 1e-6, "{name}: {most} less four standard errors");
     }
-    let smooth = albedo(&clear_plastic(1.5, 1.0, true), true, local(0.5, 0.0), 20_000, &mut rng);
-    assert!(smooth < 1.02, "{smooth}");
-    assert!(most[0] < 1.005 && most[1] < 2.5 && most[2] < 2.5, "{most:?}");
+    assert!(most[0] < 1.0 + 1e-6 && most[1] < 2.5 && most[2] < 2.5, "{most:?} less four standard errors");
 }

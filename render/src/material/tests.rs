@@ -470,12 +470,17 @@ fn extremes_are_finite() {
     let mut rng = Rng(4);
     let (eta, k) = GOLD;
     let ends = [0.0, 5.96e-8, 0.5, 1.0 - 5.97e-8];
+    let coat = |d, alpha, eta, nonlinear| rough_plastic(d, alpha, eta, 1.0, nonlinear);
+    let coats = [(Distribution::Beckmann, false), (Distribution::Ggx, true)]
+        .map(|(d, nonlinear)| [(1e-4, 1.5), (0.03, 1.000277), (1.0, 10.0)].map(|(a, eta)| coat(d, a, eta, nonlinear)))
+        .concat();
     for i in 0..100_000 {
         let alpha = |rng: &mut Rng| [1e-5, 1e-4, 1e-3, 0.03, 0.5, 1.0][(rng.u32() % 6) as usize];
         let eta_glass = [1.5, 1.0, 0.5, 1.000277, 10.0][(rng.u32() % 5) as usize];
         let white = [1.0; 3];
         let distribution = if i & 1 == 0 { Distribution::Beckmann } else { Distribution::Ggx };
-        let bsdf = match i % 10 {
+        let bsdf = match i % 11 {
+            10 => coats[(rng.u32() % 6) as usize].clone(),
             8 => Bsdf::Phong {
                 diffuse: white,
                 specular: white,

@@ -105,8 +105,14 @@ fn plain(bitmap: &Bitmap, values: &[[f64; 3]], u: f64, v: f64) -> [f64; 3] {
 }
 
 const WRAPS: [Wrap; 3] = [Wrap::Repeat, Wrap::Mirror, Wrap::Clamp];
-const FORMATS: [(u8, Texel); 5] =
-    [(3, Texel::Srgb8), (1, Texel::Srgb8), (3, Texel::Linear8), (1, Texel::Float), (3, Texel::Float)];
+const FORMATS: [(u8, Texel); 6] = [
+    (3, Texel::Srgb8),
+    (1, Texel::Srgb8),
+    (3, Texel::Linear8),
+    (1, Texel::Linear8),
+    (1, Texel::Float),
+    (3, Texel::Float),
+];
 
 #[test]
 fn look_ups_are_the_definition() {
