@@ -18,8 +18,10 @@ import sys, mitsuba as mi
 mi.set_variant('llvm_ad_rgb')
 import drjit as dr
 xml, spp, seed = sys.argv[1], int(sys.argv[2]), int(sys.argv[3])
-scene = mi.load_file(xml, **dict(kv.split('=') for kv in sys.argv[4:]))
-dr.eval(mi.render(scene, spp=spp, seed=seed))
+max_depth, rr_depth = map(int, sys.argv[4].split(','))
+scene = mi.load_file(xml, **dict(kv.split('=') for kv in sys.argv[5:]))
+integrator = mi.load_dict({'type': 'path', 'max_depth': max_depth, 'rr_depth': rr_depth}) if rr_depth else None
+dr.eval(mi.render(scene, integrator=integrator, spp=spp, seed=seed))
 dr.sync_thread()
 """
 
@@ -34,6 +36,7 @@ def main() -> None:
     p.add_argument("--pairs", type=int, default=10)
     p.add_argument("--size", type=int, default=256)
     p.add_argument("--max-depth", type=int, default=8)
+    p.add_argument("--rr-depth", type=int, default=0, help="from which ray on Mitsuba's roulette ends paths, instead of from the fifth or what the scene says")
     a = p.parse_args()
     a.work.mkdir(parents=True, exist_ok=True)
     # now, not after an hour of measuring
@@ -47,7 +50,8 @@ def main() -> None:
         spp = SPP[name]
         ours = [a.rayherd, "render", str(xml), "--size", f"{a.size}x{a.size}", "--spp", str(spp), "--max-depth", str(a.max_depth),
                 "-o", str(a.work / "bench.exr")]
-        theirs = [sys.executable, "-c", MITSUBA, str(scenes.read_by_mitsuba(xml)), str(spp), "1"] + [f"{k}={v}" for k, v in values.items()]
+        theirs = [sys.executable, "-c", MITSUBA, str(scenes.read_by_mitsuba(xml)), str(spp), "1", f"{a.max_depth},{a.rr_depth}"]
+        theirs += [f"{k}={v}" for k, v in values.items()]
         run(theirs)  # fills Mitsuba's kernel cache
         for i in range(a.pairs):
             (co, wo, _), (ct, wt, _) = run(ours), run(theirs)
@@ -56,9 +60,11 @@ def main() -> None:
         ratios = [r[7] for r in rows if r[0] == name]
         lo, hi = interval(ratios)
         print(f"{name} {spp} spp: median ratio {np.median(ratios):.3f}, 95 % interval {lo:.3f} to {hi:.3f}", flush=True)
-    with open(out, "w", newline="") as f:
+    # another run of the same day adds to it
+    with open(out, "a", newline="") as f:
         w = csv.writer(f)
-        w.writerow(["scene", "spp", "pair", "rayherd_cpu_s", "rayherd_wall_s", "mitsuba_cpu_s", "mitsuba_wall_s", "cpu_ratio"])
+        if f.tell() == 0:
+            w.writerow(["scene", "spp", "pair", "rayherd_cpu_s", "rayherd_wall_s", "mitsuba_cpu_s", "mitsuba_wall_s", "cpu_ratio"])
         w.writerows(rows)
     print(f"written to {out}")
 

@@ -5,7 +5,7 @@ import sys
 import tarfile
 from pathlib import Path
 
-NAMES = ["cornell", "cornell-box", "veach-mis", "gyroid", "staircase", "living-room", "classroom", "dining-room", "furnace", "ajar-door", "still-life", "house"]
+NAMES = ["cornell", "cornell-box", "veach-mis", "gyroid", "staircase", "living-room", "classroom", "dining-room", "furnace", "ajar-door", "still-life", "house", "bunny"]
 # of ../../examples; house is made by `rayherd scene house`
 OURS = ["furnace", "ajar-door", "still-life"]
 # of `rayherd scene many-lights`: how many lamps
@@ -74,6 +74,10 @@ SMALL = """<scene version="3.0.0">
 <translate x="1.2" y="1" z="0.2"/></transform>MATERIAL</shape>
 </scene>
 """
+
+# before the ball and the plate, on the floor; the file's triangles face inwards
+BUNNY = ('<shape type="ply"><string name="filename" value="bunny.ply"/><transform name="to_world"><scale value="8"/>'
+         '<translate x="0.3" y="-0.264" z="2.2"/></transform>' + f'<bsdf type="twosided">{MATERIALS["roughplastic"]}</bsdf></shape>\n')
 
 # one small scene per emitter, sensor and shape that is not a mesh: a ball, a copper block and a pillar on a floor
 ENVMAP = ('<emitter type="envmap"><string name="filename" value="sky.hdr"/><float name="scale" value="0.7"/><transform name="to_world">'
@@ -226,6 +230,14 @@ def prepare(name: str, shared: Path, work: Path, rayherd: str = "rayherd", size:
     if name == "house":
         subprocess.run([rayherd, "scene", "house", "--size", "2", work / "house"], check=True, stdout=subprocess.DEVNULL)
         return work / "house/house.xml"
+    if name == "bunny":
+        # the one of shared/data's meshes that Mitsuba 3.9 reads: lucy has a line of obj_info, the dragons are compressed
+        with tarfile.open(shared / "data/meshes/meshes.tar.xz") as tar:
+            member = next(m for m in tar.getmembers() if m.name.endswith("bunny.ply"))
+            (work / "bunny.ply").write_bytes(tar.extractfile(member).read())
+        out = work / "bunny.xml"
+        out.write_text(SMALL.replace("MATERIAL", MATERIALS["diffuse"]).replace("</scene>", BUNNY + "</scene>"))
+        return out
     if name in MATERIALS:
         out = work / f"material-{name}.xml"
         out.write_text(SMALL.replace("MATERIAL", MATERIALS[name]))
