@@ -14,7 +14,7 @@ MANY_LIGHTS = {"many-lights-100": 100, "many-lights-1000": 1000, "many-lights-10
 ROOMS = {"staircase": "scene.xml", "living-room": "scene.xml", "classroom": "scene.xml", "dining-room": "scene_sunsky.xml"}
 # samples of one render and number of renders: three standard errors below 0.5 % of each channel's mean. Nearly all of veach-mis' noise is
 # in one pixel, which shows part of its smallest light and holds a fifth of the picture's energy
-ENOUGH = {"veach-mis": (1280, 64)}
+ENOUGH = {"veach-mis": (768, 64), "classroom": (128, 64), "dining-room": (128, 64), "ajar-door": (256, 64)}
 
 # Mitsuba starts a ray 8.9e-5 (1 + the largest coordinate) off its surface: 1.4e-3 at veach-mis' front edge, which moves the edges of shadows there by
 # 1/100 of a pixel, so that their rows of pixels differ by up to 1.7 %. It is a third of that where the front edge is near the origin
