@@ -1,6 +1,11 @@
 //! A scene's primitives as a stream in source order: what preparing reads.
 
+use rayherd_render::bvh::MAX_COORDINATE;
+
 use crate::ImportError;
+
+/// Coordinates beyond this are not used. Recentring at most doubles it, which blocks can still hold.
+pub(crate) const LARGEST: f64 = (MAX_COORDINATE / 2.0) as f64;
 
 /// A triangle with its attributes, in world space.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -37,6 +42,42 @@ pub enum Record {
     Triangle(TriangleRecord),
     /// A sphere.
     Sphere(SphereRecord),
+}
+
+/// Why a record is skipped.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Skip {
+    Degenerate,
+    NonFinite,
+    OutOfRange,
+}
+
+impl Record {
+    /// Index into the description's shapes.
+    pub(crate) fn shape(&self) -> u32 {
+        let (Record::Triangle(TriangleRecord { shape, .. }) | Record::Sphere(SphereRecord { shape, .. })) = self;
+        *shape
+    }
+
+    /// Whether its numbers can be computed with.
+    pub(crate) fn sound(&self) -> Result<(), Skip> {
+        let (finite, within) = match self {
+            Record::Triangle(t) => {
+                let largest = t.p.as_flattened().iter().fold(0.0f64, |m, x| m.max(x.abs()));
+                // max() ignores NaN
+                (t.p.as_flattened().iter().all(|x| x.is_finite()), largest <= LARGEST)
+            }
+            Record::Sphere(s) => {
+                let largest = s.center.iter().fold(0.0f64, |m, x| m.max(x.abs())) + s.radius;
+                (s.center.iter().all(|x| x.is_finite()) && s.radius.is_finite(), largest <= LARGEST)
+            }
+        };
+        match (finite, within) {
+            (false, _) => Err(Skip::NonFinite),
+            (true, false) => Err(Skip::OutOfRange),
+            (true, true) => Ok(()),
+        }
+    }
 }
 
 /// A pass over the source.

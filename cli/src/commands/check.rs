@@ -12,14 +12,15 @@ use rayherd_scene::description::{
     Amount, Beam, Bsdf, Description, Environment, Geometry, Material, MeshFormat, Projection, TextureKind,
 };
 use rayherd_scene::import::{ImportOptions, Survey, import, sky_map};
-use rayherd_scene::prepare::{Cut, PrepareSettings};
+use rayherd_scene::prepare::{Cut, PrepareError, PrepareSettings, foresee};
 
 use super::{print, size};
 use crate::options::{self, SceneOptions};
 
 /// Say what a scene holds and what of it is not supported; render nothing
 ///
-/// Exits with 2 when something is unsupported (each named with file and line; with --substitute that is allowed) or cannot be read.
+/// Exits with 2 when something is unsupported (each named with file and line; with --substitute that is allowed), cannot be read, or leaves
+/// nothing to see or no light.
 #[derive(Args)]
 #[command(after_help = "Examples:\n  rayherd check scene.xml\n  rayherd check chest --iso -789.5\n  \
     rayherd check scene.xml --substitute")]
@@ -42,13 +43,22 @@ pub fn run(arguments: &Arguments) -> anyhow::Result<ExitCode> {
     let description = import(Path::new(&arguments.scene), &options)?;
     let survey = Survey::of(&description);
     let (text, mut problems) = (tell(&arguments.scene, &description, &survey), problems(&description, &survey));
+    let mut warnings: Vec<String> = survey.walled_in.iter().cloned().collect();
+    // where a file ends too early, what is missing tells nothing of the scene
+    if survey.shapes.iter().all(|s| s.error.is_none()) {
+        match foresee(&description, &survey) {
+            Ok(told) => warnings.extend(told),
+            Err(error @ PrepareError::Dark { .. }) => problems.push(error.to_string()),
+            Err(error) => problems.push(format!("{}: {error}", arguments.scene)),
+        }
+    }
     for s in &description.substitutions {
         let line = format!("{}: {} is not supported; --substitute puts in its place: {}", s.place, s.what, s.stand_in);
         if spec.scene.substitute { tracing::info!("{line}") } else { problems.push(line) }
     }
     print(&text)?;
     description.notes.iter().for_each(|note| eprintln!("{}: {}", note.place, note.text));
-    survey.walled_in.iter().for_each(|text| eprintln!("warning: {text}"));
+    warnings.iter().for_each(|text| eprintln!("warning: {text}"));
     problems.iter().for_each(|p| eprintln!("{p}"));
     if problems.is_empty() {
         return Ok(ExitCode::SUCCESS);
@@ -83,7 +93,11 @@ fn tell(scene: &str, description: &Description, survey: &Survey) -> String {
     line("shapes", kinds(description.shapes.iter().map(|s| geometry(&s.geometry))));
     line("primitives", format!("{}, {}", count(triangles, "triangle"), count(spheres, "sphere")));
     let (flat, bad) = (survey.sum(|s| s.flat), survey.sum(|s| s.not_finite));
-    line("skipped", format!("{flat} of zero area, {bad} with NaN or infinity"));
+    let far = match survey.sum(|s| s.out_of_range) {
+        0 => String::new(),
+        n => format!(", {n} beyond 2^39 units"),
+    };
+    line("skipped", format!("{flat} of zero area, {bad} with NaN or infinity{far}"));
     let [lo, hi] = survey.bounds;
     if lo[0] <= hi[0] {
         line("box", format!("{lo:.4?} to {hi:.4?}"));

@@ -155,7 +155,10 @@ fn place_camera(
         };
         let size = *out.size.get_or_insert(options.size.unwrap_or(framing::SIZE));
         let Some(frame) = framing::frame(bounds, up, size) else {
-            return refuse(path, "no primitive with finite vertices and an extent: there is nothing to look at");
+            return refuse(
+                path,
+                "no primitive with finite vertices and an extent: there is nothing to look at; check its transforms and its scale",
+            );
         };
         if out.camera.is_none() {
             tracing::info!("the source has no camera; one is placed to frame it");

@@ -7,7 +7,7 @@ use super::stream::{DescriptionSource, StreamOptions};
 use crate::ImportError;
 use crate::description::{Description, TextureKind};
 use crate::image;
-use crate::record::{Record, SphereRecord, TriangleRecord};
+use crate::record::{Record, Skip};
 
 /// Of a geometry object a triangle takes about this (eight-wide nodes, vertices, ids; measured 51.8 on 8 million triangles).
 const BYTES_PER_TRIANGLE: u64 = 52;
@@ -38,10 +38,12 @@ pub struct ShapeSurvey {
     pub triangles: u64,
     /// Spheres.
     pub spheres: u64,
-    /// Triangles of no area, as f64 sees them: skipped when preparing.
+    /// Primitives of no area, as f64 sees them: skipped when preparing.
     pub flat: u64,
     /// Primitives with NaN or infinite coordinates: skipped when preparing.
     pub not_finite: u64,
+    /// Primitives beyond 2^39 units: skipped when preparing.
+    pub out_of_range: u64,
     /// Triangles with shading normals.
     pub with_normals: u64,
     /// Triangles with texture coordinates.
@@ -50,6 +52,13 @@ pub struct ShapeSurvey {
     pub with_attribute: u64,
     /// Why it could not be read to its end.
     pub error: Option<ImportError>,
+}
+
+impl ShapeSurvey {
+    /// Primitives that can be hit.
+    pub fn usable(&self) -> u64 {
+        self.triangles + self.spheres - self.flat - self.not_finite - self.out_of_range
+    }
 }
 
 impl Survey {
@@ -147,16 +156,19 @@ fn read(
             return Ok(stream.bytes_read());
         }
         for record in &records {
-            let finite = super::bounds::add(bounds, record);
+            super::bounds::add(bounds, record);
             // a file's parts are shapes of their own
-            let (Record::Triangle(TriangleRecord { shape, .. }) | Record::Sphere(SphereRecord { shape, .. })) = record;
-            let shape = &mut shapes[*shape as usize];
-            shape.not_finite += u64::from(!finite);
+            let shape = &mut shapes[record.shape() as usize];
             sight.iter_mut().for_each(|sight| sight.see(record));
+            match record.sound().and_then(|()| if has_area(record) { Ok(()) } else { Err(Skip::Degenerate) }) {
+                Ok(()) => {}
+                Err(Skip::Degenerate) => shape.flat += 1,
+                Err(Skip::NonFinite) => shape.not_finite += 1,
+                Err(Skip::OutOfRange) => shape.out_of_range += 1,
+            }
             match record {
                 Record::Triangle(t) => {
                     shape.triangles += 1;
-                    shape.flat += u64::from(finite && super::vector::cross(edge(t.p, 1), edge(t.p, 2)) == [0.0; 3]);
                     shape.with_normals += u64::from(t.n.is_some());
                     shape.with_uv += u64::from(t.uv.is_some());
                     shape.with_attribute += u64::from(t.attribute.is_some());
@@ -164,6 +176,13 @@ fn read(
                 Record::Sphere(_) => shape.spheres += 1,
             }
         }
+    }
+}
+
+fn has_area(record: &Record) -> bool {
+    match record {
+        Record::Triangle(t) => super::vector::cross(edge(t.p, 1), edge(t.p, 2)) != [0.0; 3],
+        Record::Sphere(s) => s.radius > 0.0,
     }
 }
 

@@ -1,25 +1,23 @@
 //! Reading the source: its bounds, then its records, recentred and checked.
 
-use rayherd_render::bvh::MAX_COORDINATE;
 use rayherd_render::ray::PrimId;
 use rayherd_render::world::{EmissivePrimitive, Glow, Primitive};
 
 use super::progress::{PrepareProgress, Stage};
 use super::records::{ATTRIBUTES, Extra, NORMALS, Records, SphereBits, UVS};
 use super::spool::Spool;
+use super::usable::{Had, emits};
 use super::{PrepareError, SpoolSettings};
 use crate::description::{Description, Geometry, Shape};
 use crate::grid::count::{Box3, box_of};
 use crate::grid::lattice::{round_down, round_up};
 use crate::manifest::Counts;
-use crate::record::{Record, RecordSource, RecordStream, SphereRecord, TriangleRecord};
+use crate::record::{LARGEST, Record, RecordSource, RecordStream, Skip, SphereRecord, TriangleRecord};
 
 /// Records asked for at a time.
 const BATCH: usize = 4096;
 /// Primitives in a chunk of the spool.
 const CHUNK: usize = 16_384;
-/// Source coordinates beyond this are not used. Recentring at most doubles it, which blocks can still hold.
-const LARGEST: f64 = (MAX_COORDINATE / 2.0) as f64;
 
 /// Bytes of records that are kept where the bounds were found, so that the source is not read again; and of files that are tried. No setting: the manifest
 /// says how often the source was read. As much as waits in memory anyway ([`SpoolSettings::default`]).
@@ -45,6 +43,8 @@ pub(crate) struct Ingested {
     pub hi: [f32; 3],
     /// Box of what does not emit light, inside out if there is nothing.
     dark: Box3,
+    /// By shape.
+    pub had: Vec<Had>,
     pub emissive: Vec<EmissivePrimitive>,
     /// Of those of them whose shape's emission a texture gives; weights are still to be found.
     pub glows: Vec<Glow>,
@@ -53,29 +53,16 @@ pub(crate) struct Ingested {
 }
 
 impl Ingested {
-    /// Whether anything does not emit light.
-    pub fn has_dark(&self) -> bool {
-        self.dark[0][0] <= self.dark[1][0]
-    }
-
     /// The box that the grid's equal cells fill: that of what does not emit light, if there is anything. Lamps are few, and
     /// may be far away. Its upper corner lies just outside where something is above, since a cell does not hold its
     /// upper face.
     pub fn inner(&self) -> Box3 {
         let [lo, hi] = self.dark;
-        if !self.has_dark() {
+        if lo[0] > hi[0] {
             return [self.lo, self.hi];
         }
         [lo, std::array::from_fn(|a| if hi[a] < self.hi[a] { hi[a].next_up() } else { hi[a] })]
     }
-}
-
-/// Why a record is skipped.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Skip {
-    Degenerate,
-    NonFinite,
-    OutOfRange,
 }
 
 /// Shows the records of a pass to `see`, in order, many at a time, which it may take; the bytes that were read for it.
@@ -130,7 +117,7 @@ pub(crate) fn bounds(
     let bytes = each(stream, Stage::Bounds, progress, |batch| {
         for record in batch.iter() {
             match record {
-                _ if sound(record).is_err() => {}
+                _ if record.sound().is_err() => {}
                 Record::Triangle(t) => t.p.iter().for_each(|p| add(*p, 0.0)),
                 Record::Sphere(s) => add(s.center, s.radius),
             }
@@ -170,6 +157,7 @@ pub(crate) fn ingest(
         lo: [f32::INFINITY; 3],
         hi: [f32::NEG_INFINITY; 3],
         dark: [[f32::INFINITY; 3], [f32::NEG_INFINITY; 3]],
+        had: vec![Had::default(); description.shapes.len()],
         emissive: Vec::new(),
         glows: Vec::new(),
         hashers: Default::default(),
@@ -197,33 +185,8 @@ pub(crate) fn ingest(
     if attributes.count() > 0 {
         hasher.update(attributes.finalize().as_bytes());
     }
-    let Reader { spool, counts, lo, hi, dark, emissive, glows, .. } = reader;
-    // where there is nothing at all, that is said instead
-    if counts.degenerate > 0 && counts.triangles + counts.spheres > 0 {
-        lit(description, &emissive)?;
-    }
-    Ok(Ingested { spool, counts, lo, hi, dark, emissive, glows, hash: hasher.finalize() })
-}
-
-/// Tells of shapes that emit and have no area; an error where nothing else emits.
-fn lit(description: &Description, emissive: &[EmissivePrimitive]) -> Result<(), PrepareError> {
-    let mut lit = vec![false; description.shapes.len()];
-    emissive.iter().for_each(|e| lit[e.shape as usize] = true);
-    let unlit: Vec<_> = description.shapes.iter().zip(&lit).filter(|(s, lit)| emits(s.emission) && !**lit).collect();
-    let Some((first, _)) = unlit.first() else { return Ok(()) };
-    let far = description.environment.is_some() || description.sun.is_some();
-    if emissive.is_empty() && description.beams.is_empty() && !far {
-        return Err(PrepareError::Dark { shape: first.name.clone(), place: first.place.clone() });
-    }
-    for (shape, _) in unlit.iter().take(10) {
-        tracing::warn!("{}: shape {:?} emits, but has no area: it gives no light", shape.place, shape.name);
-    }
-    Ok(())
-}
-
-/// Whether an emission is light.
-pub(crate) fn emits(emission: Option<[f32; 3]>) -> bool {
-    emission.is_some_and(|e| e.iter().any(|&x| x > 0.0))
+    let Reader { spool, counts, lo, hi, dark, had, emissive, glows, .. } = reader;
+    Ok(Ingested { spool, counts, lo, hi, dark, had, emissive, glows, hash: hasher.finalize() })
 }
 
 struct Reader<'a> {
@@ -235,6 +198,7 @@ struct Reader<'a> {
     lo: [f32; 3],
     hi: [f32; 3],
     dark: Box3,
+    had: Vec<Had>,
     emissive: Vec<EmissivePrimitive>,
     glows: Vec<Glow>,
     /// One for each array, so that the sum does not depend on where chunks end.
@@ -245,10 +209,14 @@ impl Reader<'_> {
     fn add(&mut self, record: &Record) -> Result<(), PrepareError> {
         let id = self.counts.records;
         self.counts.records += 1;
-        let added = sound(record).and_then(|()| match record {
+        let added = record.sound().and_then(|()| match record {
             Record::Triangle(t) => self.triangle(id, t),
             Record::Sphere(s) => self.sphere(id, s),
         });
+        if let Some(had) = self.had.get_mut(record.shape() as usize) {
+            had.any = true;
+            had.usable |= added.is_ok();
+        }
         match added {
             Ok(()) => {}
             Err(Skip::Degenerate) => self.counts.degenerate += 1,
@@ -347,26 +315,6 @@ impl Reader<'_> {
 
 /// Texture coordinates and attribute.
 type Look = (Option<[[f32; 2]; 3]>, Option<[[f32; 3]; 3]>);
-
-/// Whether a record's numbers can be computed with.
-fn sound(record: &Record) -> Result<(), Skip> {
-    let (finite, within) = match record {
-        Record::Triangle(t) => {
-            let largest = t.p.as_flattened().iter().fold(0.0f64, |m, x| m.max(x.abs()));
-            // max() ignores NaN
-            (t.p.as_flattened().iter().all(|x| x.is_finite()), largest <= LARGEST)
-        }
-        Record::Sphere(s) => {
-            let largest = s.center.iter().fold(0.0f64, |m, x| m.max(x.abs())) + s.radius;
-            (s.center.iter().all(|x| x.is_finite()) && s.radius.is_finite(), largest <= LARGEST)
-        }
-    };
-    match (finite, within) {
-        (false, _) => Err(Skip::NonFinite),
-        (true, false) => Err(Skip::OutOfRange),
-        (true, true) => Ok(()),
-    }
-}
 
 /// Whether a triangle's area vanishes: its cross product is zero in f64. Differences of f32 are exact there (but for
 /// exponents more than 29 apart), and so are their products.

@@ -31,6 +31,7 @@ mod spool;
 #[cfg(test)]
 mod tests;
 mod textures;
+mod usable;
 mod world;
 
 use std::io;
@@ -47,7 +48,7 @@ use crate::description::{Description, Place};
 use crate::grid::count::{Counter, Primitives, candidates, choose};
 use crate::grid::{CellData, GridData, Lattice};
 use crate::import;
-use crate::manifest::{Counts, Defaults, FORMAT, GridChoice, Manifest, ManifestError};
+use crate::manifest::{Defaults, FORMAT, GridChoice, Manifest, ManifestError};
 use crate::objects::{ObjectError, ObjectKind, ObjectRef, ObjectStore};
 use crate::overlap;
 use crate::record::RecordSource;
@@ -67,6 +68,7 @@ pub use fingerprint::{fingerprint, source_files};
 pub use progress::{NoProgress, PrepareProgress, Stage};
 pub use report::{ByteKind, ByteOp, ByteRow, PrepareReport};
 pub use settings::{Cut, PrepareSettings, SpoolSettings};
+pub use usable::foresee;
 
 /// A prepared scene.
 #[derive(Clone, Debug)]
@@ -118,7 +120,8 @@ pub enum PrepareError {
     },
     /// What emits has no area.
     #[error(
-        "{place}: shape {shape:?} emits, but has no area, and nothing else gives light: give it a size, or pass --light or --sky"
+        "{place}: shape {shape:?} emits, but has no area (it is flat or empty, or its vertices are not finite or too far away), and nothing else \
+         gives light: give it a size, or pass --light or --sky"
     )]
     Dark {
         /// Name of the first such shape.
@@ -306,11 +309,8 @@ fn read(
     let offset = std::array::from_fn(|a| 0.5 * (lo[a] + hi[a]));
     let again = kept.is_none();
     let mut ingested = ingest::ingest(description, (source, kept), offset, spool, progress)?;
-    let Counts { records, triangles, spheres, degenerate, non_finite, out_of_range, .. } = ingested.counts;
-    // lights that were added to a surface are no scene; lights alone that the source has are one
-    let meant_dark = description.shapes.iter().any(|s| !ingest::emits(s.emission));
-    if triangles + spheres == 0 || (meant_dark && !ingested.has_dark()) {
-        return Err(PrepareError::Empty { records, degenerate, non_finite, out_of_range });
+    for text in usable::judge(description, &ingested.counts, &ingested.had)? {
+        tracing::warn!("{text}");
     }
     ingested.counts.source_reads = description.passes + u32::from(known.is_none()) + u32::from(again);
     ingested.counts.source_bytes += bytes + description.bytes_read;

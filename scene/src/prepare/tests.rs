@@ -8,10 +8,10 @@ use rayherd_render::world::World;
 use rayherd_tests::mutation::Random;
 
 use super::*;
-use crate::description::{Affine, Bsdf, Geometry, Material, Place, Shape};
+use crate::description::{Affine, Bsdf, Environment, Geometry, Material, Place, Shape};
 use crate::grid::touch::{sphere_cells, triangle_cells};
 use crate::grid::{Progress, SplitSet};
-use crate::manifest::SplitEntry;
+use crate::manifest::{Counts, SplitEntry};
 use crate::objects::{DirectoryObjects, MemoryObjects, ObjectHash};
 use crate::record::{Record, RecordStream, SphereRecord, TriangleRecord};
 
@@ -63,6 +63,8 @@ fn description(name: &str) -> Description {
     Description {
         shapes: vec![shape(format!("{name} dark"), None), shape(format!("{name} light"), Some([1.0, 2.0, 3.0]))],
         materials: vec![Material::new("grey", Bsdf::Diffuse { reflectance: [0.5; 3] }, true)],
+        // so that the lamp need not be there
+        environment: Some(Environment::Constant([1.0; 3])),
         ..Default::default()
     }
 }
@@ -423,6 +425,27 @@ fn what_cannot_be_prepared_is_said() {
     let empty = run(&[flat, far], &settings(2, true), &store).unwrap_err();
     assert!(matches!(empty, PrepareError::Empty { records: 2, degenerate: 1, out_of_range: 1, .. }), "{empty}");
     assert!(matches!(run(&[flat], &settings(0, true), &store), Err(PrepareError::Settings(_))));
+    // a lamp of nothing that can be hit, and no other light
+    let dark = Description { environment: None, ..description("list") };
+    let triangle = |shape, x| {
+        Record::Triangle(TriangleRecord {
+            p: [[0.0; 3], [x, 0.0, 0.0], [0.0, 1.0, 0.0]],
+            n: None,
+            uv: None,
+            attribute: None,
+            shape,
+        })
+    };
+    let prepared = |description: &Description, lamp: &[Record]| {
+        let source = List::new([&[triangle(0, 1.0)][..], lamp].concat());
+        prepare(description, &source, &settings(1, true), &SpoolSettings::default(), &store, &NoProgress)
+    };
+    for lamp in [vec![], vec![triangle(1, f64::NAN)], vec![triangle(1, 0.0)], vec![triangle(1, 1e30)]] {
+        let error = prepared(&dark, &lamp).unwrap_err();
+        assert!(matches!(&error, PrepareError::Dark { shape, .. } if shape == "list light"), "{lamp:?}: {error}");
+        assert!(prepared(&description("list"), &lamp).is_ok(), "{lamp:?}");
+    }
+    assert!(prepared(&dark, &[triangle(1, 1.0)]).is_ok());
     let lost = SpoolSettings { memory: 0, folder: Some("/nowhere/at/all".into()), ..SpoolSettings::default() };
     let source = List::new(scene(1, 100));
     let error = prepare(&description("list"), &source, &settings(2, true), &lost, &store, &NoProgress).unwrap_err();
