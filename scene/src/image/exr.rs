@@ -7,7 +7,7 @@ use exr::meta::attribute::IntegerBounds;
 use exr::prelude::{Compression, FlatSamples, MetaData, ReadChannels, ReadLayers};
 use rayherd_render::texture::Texel;
 
-use super::{Header, Image, check, plausible};
+use super::{AGAIN, Header, Image, check, plausible};
 
 /// No compression of OpenEXR does better than deflate, which makes at most 1032 bytes of one; twice, as halves become floats, and some.
 const MOST_EXPANSION: u64 = 2200;
@@ -39,7 +39,7 @@ fn header_of(meta: &MetaData, length: u64) -> Result<(Header, Vec<String>), Stri
         return Err("has a data window that is not its display window: crop it".into());
     }
     let header = Header { size: [side(size.x()), side(size.y())], channels: names.len() as u8, texel: Texel::Float };
-    check(&header)?;
+    check(header.size)?;
     for other in &meta.headers {
         // every layer is read
         let pixels = other.layer_size.width() as u64 * other.layer_size.height() as u64;
@@ -52,12 +52,14 @@ fn header_of(meta: &MetaData, length: u64) -> Result<(Header, Vec<String>), Stri
 }
 
 pub(super) fn header(file: BufReader<File>, length: u64) -> Result<Header, String> {
-    let meta = MetaData::read_from_buffered(file, false).map_err(|e| format!("cannot be read as EXR: {e}"))?;
+    let meta =
+        MetaData::read_from_buffered(file, false).map_err(|e| format!("cannot be read as EXR ({e}): {AGAIN}"))?;
     Ok(header_of(&meta, length)?.0)
 }
 
 pub(super) fn read(mut file: BufReader<File>, length: u64) -> Result<Image, String> {
-    let meta = MetaData::read_from_buffered(&mut file, false).map_err(|e| format!("cannot be read as EXR: {e}"))?;
+    let meta =
+        MetaData::read_from_buffered(&mut file, false).map_err(|e| format!("cannot be read as EXR ({e}): {AGAIN}"))?;
     let (header, names) = header_of(&meta, length)?;
     std::io::Seek::rewind(&mut file).map_err(|e| format!("cannot be read: {e}"))?;
     let image = exr::prelude::read()
@@ -69,7 +71,7 @@ pub(super) fn read(mut file: BufReader<File>, length: u64) -> Result<Image, Stri
         // a panic on one of its threads would end the process
         .non_parallel()
         .from_buffered(file)
-        .map_err(|e| format!("cannot be read to its end: {e}"))?;
+        .map_err(|e| format!("cannot be read to its end ({e}): {AGAIN}"))?;
     let channels = &image.layer_data.channel_data.list;
     let find = |name: &String| channels.iter().find(|c| c.name.to_string() == *name).map(|c| &c.sample_data);
     let samples: Option<Vec<&FlatSamples>> = names.iter().map(find).collect();

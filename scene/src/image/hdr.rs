@@ -5,7 +5,7 @@ use std::io::{BufRead, BufReader, Read};
 
 use rayherd_render::texture::Texel;
 
-use super::{Header, Image, check, plausible};
+use super::{AGAIN, Header, Image, check, plausible};
 
 /// Most bytes of a header: a line and all lines.
 const MOST_HEADER: u64 = 64 << 10;
@@ -19,7 +19,7 @@ fn open(file: &mut BufReader<File>, length: u64) -> Result<Header, String> {
         let n = file.take(left).read_until(b'\n', &mut bytes).map_err(|e| format!("cannot be read: {e}"))?;
         left -= n as u64;
         if bytes.pop() != Some(b'\n') {
-            return Err("is cut off in its header".into());
+            return Err(format!("is cut off in its header: {AGAIN}"));
         }
         Ok(String::from_utf8_lossy(&bytes).trim_end().to_owned())
     };
@@ -39,9 +39,9 @@ fn open(file: &mut BufReader<File>, length: u64) -> Result<Header, String> {
     let ["-Y", height, "+X", width] = words[..] else {
         return Err(format!("has its rows in another order than from the upper left (\"{size}\"): save it anew"));
     };
-    let side = |text: &str| text.parse::<u32>().map_err(|_| format!("has no size in \"{size}\""));
+    let side = |text: &str| text.parse::<u32>().map_err(|_| format!("has no size in \"{size}\": {AGAIN}"));
     let header = Header { size: [side(width)?, side(height)?], channels: 3, texel: Texel::Float };
-    check(&header)?;
+    check(header.size)?;
     plausible(&header, length, MOST_EXPANSION)?;
     Ok(header)
 }
@@ -56,7 +56,7 @@ pub(super) fn read(mut file: BufReader<File>, length: u64) -> Result<Image, Stri
     let mut bytes = Vec::with_capacity(header.bytes() as usize);
     let mut row = vec![[0u8; 4]; width];
     for y in 0..height {
-        scanline(&mut file, &mut row).map_err(|why| format!("row {y}: {why}"))?;
+        scanline(&mut file, &mut row).map_err(|why| format!("row {y}: {why}: {AGAIN}"))?;
         for &[r, g, b, e] in &row {
             // 2^(e - 136): an exact power of two, smallest 2^-135
             let scale = if e == 0 { 0.0 } else { libm::ldexp(1.0, i32::from(e) - 136) };
@@ -76,7 +76,7 @@ fn scanline(file: &mut BufReader<File>, row: &mut [[u8; 4]]) -> Result<(), Strin
     let coded = (8..0x8000).contains(&width) && head[..2] == [2, 2] && head[2] < 0x80;
     if !coded {
         if head[..3] == [1, 1, 1] {
-            return Err("has runs of the oldest kind, which are not read: save it anew".into());
+            return Err("has runs of the oldest kind, which are not read".into());
         }
         row[0] = head;
         return row[1..].iter_mut().try_for_each(|texel| exact(texel));

@@ -6,9 +6,13 @@ use std::io::BufReader;
 use jpeg_decoder::{Decoder, Error, PixelFormat};
 use rayherd_render::texture::Texel;
 
-use super::{Header, Image, check};
+use super::{AGAIN, Header, Image, check, plausible};
 
-fn open(file: BufReader<File>, raw: bool) -> Result<(Decoder<BufReader<File>>, Header), String> {
+/// Most texels that a byte makes: a block of 8 x 8 samples takes a bit at least, that of its mean, and where no channel is as fine as the image all together
+/// have more than half as many samples as it has texels.
+const MOST_EXPANSION: u64 = 2 * 8 * 64;
+
+fn open(file: BufReader<File>, length: u64, raw: bool) -> Result<(Decoder<BufReader<File>>, Header), String> {
     let mut decoder = Decoder::new(file);
     decoder.read_info().map_err(said)?;
     let info = decoder.info().ok_or("says no size")?;
@@ -20,22 +24,23 @@ fn open(file: BufReader<File>, raw: bool) -> Result<(Decoder<BufReader<File>>, H
     };
     let size = [info.width.into(), info.height.into()];
     let header = Header { size, channels, texel: if raw { Texel::Linear8 } else { Texel::Srgb8 } };
-    check(&header)?;
+    check(header.size)?;
+    plausible(&header, length, MOST_EXPANSION * u64::from(channels))?;
     Ok((decoder, header))
 }
 
-pub(super) fn header(file: BufReader<File>, raw: bool) -> Result<Header, String> {
-    Ok(open(file, raw)?.1)
+pub(super) fn header(file: BufReader<File>, length: u64, raw: bool) -> Result<Header, String> {
+    Ok(open(file, length, raw)?.1)
 }
 
-pub(super) fn read(file: BufReader<File>, raw: bool) -> Result<Image, String> {
-    let (mut decoder, header) = open(file, raw)?;
+pub(super) fn read(file: BufReader<File>, length: u64, raw: bool) -> Result<Image, String> {
+    let (mut decoder, header) = open(file, length, raw)?;
     Ok(Image { bytes: decoder.decode().map_err(said)?, header })
 }
 
 fn said(error: Error) -> String {
     match error {
-        Error::Io(e) if e.kind() == std::io::ErrorKind::UnexpectedEof => "is cut off".into(),
-        e => format!("cannot be read as JPEG: {e}"),
+        Error::Io(e) if e.kind() == std::io::ErrorKind::UnexpectedEof => format!("is cut off: {AGAIN}"),
+        e => format!("cannot be read as JPEG ({e}): {AGAIN}"),
     }
 }

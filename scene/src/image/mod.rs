@@ -23,6 +23,8 @@ use crate::import::regular;
 const MOST_FILE: u64 = 1 << 30;
 /// Most texels of an image: 16384 x 8192.
 const MOST_TEXELS: u64 = 1 << 27;
+/// What to do about a file that is cut off or damaged.
+const AGAIN: &str = "get it again, or save it anew";
 
 /// What an image's header says.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -80,12 +82,12 @@ enum Format {
 pub fn header(path: &Path, raw: bool) -> Result<Header, String> {
     let (format, file, length) = open(path)?;
     let header = match format {
-        Format::Png => png::header(file, raw),
-        Format::Jpeg => jpeg::header(file, raw),
+        Format::Png => png::header(file, length, raw),
+        Format::Jpeg => jpeg::header(file, length, raw),
         Format::Exr => exr::header(file, length),
         Format::Hdr => hdr::header(file, length),
     }?;
-    check(&header)?;
+    check(header.size)?;
     Ok(header)
 }
 
@@ -105,14 +107,15 @@ pub fn read(path: &Path, raw: bool) -> Result<Image, String> {
     let (format, file, length) = open(path)?;
     // a decoder that panics on a damaged file must not end the process
     let image = std::panic::catch_unwind(std::panic::AssertUnwindSafe(|| match format {
-        Format::Png => png::read(file, raw),
-        Format::Jpeg => jpeg::read(file, raw),
+        Format::Png => png::read(file, length, raw),
+        Format::Jpeg => jpeg::read(file, length, raw),
         Format::Exr => exr::read(file, length),
         Format::Hdr => hdr::read(file, length),
     }))
-    .unwrap_or_else(|_| Err("is damaged: its decoder gave up".into()))?;
+    .unwrap_or_else(|_| Err(format!("is damaged, its decoder gave up: {AGAIN}")))?;
     if image.bytes.len() as u64 != image.header.bytes() {
-        return Err(format!("has {} bytes of texels instead of {}", image.bytes.len(), image.header.bytes()));
+        let (found, claimed) = (image.bytes.len(), image.header.bytes());
+        return Err(format!("has {found} bytes of texels instead of {claimed}: {AGAIN}"));
     }
     Ok(image)
 }
@@ -136,7 +139,7 @@ fn open(path: &Path) -> Result<(Format, BufReader<File>, u64), String> {
         [0xff, 0xd8, 0xff, ..] => Format::Jpeg,
         [0x76, 0x2f, 0x31, 0x01, ..] => Format::Exr,
         head if head.starts_with(b"#?") => Format::Hdr,
-        [] => return Err("is empty".into()),
+        [] => return Err(format!("is empty: {AGAIN}")),
         _ => return Err("is no PNG, JPEG, OpenEXR or Radiance HDR image: convert it to one of them".into()),
     };
     std::io::Seek::rewind(&mut file).map_err(io)?;
@@ -144,10 +147,9 @@ fn open(path: &Path) -> Result<(Format, BufReader<File>, u64), String> {
 }
 
 /// Whether a header's size can be; asked before memory is taken.
-fn check(header: &Header) -> Result<(), String> {
-    let [w, h] = header.size;
+fn check([w, h]: [u32; 2]) -> Result<(), String> {
     if w == 0 || h == 0 {
-        return Err(format!("has {w} x {h} texels"));
+        return Err(format!("has {w} x {h} texels: {AGAIN}"));
     }
     if w > Bitmap::MOST || h > Bitmap::MOST || u64::from(w) * u64::from(h) > MOST_TEXELS {
         let (most, texels) = (Bitmap::MOST, MOST_TEXELS);
@@ -161,7 +163,8 @@ fn check(header: &Header) -> Result<(), String> {
 /// Whether a file of `length` bytes can hold so many of texels, if each byte makes at most `most`.
 fn plausible(header: &Header, length: u64, most: u64) -> Result<(), String> {
     if header.bytes() > length.saturating_mul(most) {
-        return Err(format!("is damaged: its header claims {} bytes of texels in a file of {length}", header.bytes()));
+        let claimed = header.bytes();
+        return Err(format!("is damaged, its header claims {claimed} bytes of texels in a file of {length}: {AGAIN}"));
     }
     Ok(())
 }

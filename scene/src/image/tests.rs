@@ -32,6 +32,24 @@ fn png(color: ::png::ColorType, depth: ::png::BitDepth, [w, h]: [u32; 2], data: 
     out
 }
 
+/// A sound PNG but for its image, of which there is the end alone.
+fn hollow_png(color: ::png::ColorType, [w, h]: [u32; 2]) -> Vec<u8> {
+    let mut out = Vec::new();
+    let mut encoder = ::png::Encoder::new(&mut out, w, h);
+    encoder.set_color(color);
+    encoder.write_header().unwrap().write_chunk(::png::chunk::IDAT, b"\x78\x9c\x03\0\0\0\0\x01").unwrap();
+    out
+}
+
+/// [`JPEG`] with another size in its header.
+fn jpeg_of(width: u16, height: u16) -> Vec<u8> {
+    let mut out = JPEG.to_vec();
+    let frame = out.windows(2).position(|w| matches!(w, [0xff, 0xc0 | 0xc2])).unwrap();
+    out[frame + 5..frame + 7].copy_from_slice(&height.to_be_bytes());
+    out[frame + 7..frame + 9].copy_from_slice(&width.to_be_bytes());
+    out
+}
+
 fn exr_file(names: &[&str], size: (usize, usize)) -> Vec<u8> {
     let n = size.0 * size.1;
     let channel = |(k, name): (usize, &&str)| {
@@ -177,7 +195,9 @@ fn files_that_are_cut_off() {
         assert!(read(&path, false).is_ok(), "{name}");
         for n in [0, 1, 3, 20, bytes.len() / 4, bytes.len() / 2, bytes.len() * 3 / 4] {
             let path = folder.write(name, &bytes[..n]);
-            assert!(read(&path, false).is_err(), "{name} of {n} bytes of {}", bytes.len());
+            let Err(error) = read(&path, false) else { panic!("{name} of {n} bytes of {}", bytes.len()) };
+            // what begins as no image is told so
+            assert!(n < 20 || error.contains("get it again, or save it anew"), "{name} of {n} bytes: {error}");
         }
     }
     assert!(read(&folder.write("a.png", b"GIF89a no image of ours"), false).unwrap_err().contains("no PNG"));
@@ -189,10 +209,20 @@ fn files_that_are_cut_off() {
 fn sizes_that_lie() {
     let folder = Folder::new();
     let before = mutation::peak_memory();
-    let mut big = samples()[0].1.clone();
-    // width and height in IHDR, whose checksum then is wrong as well
-    big[16..24].copy_from_slice(&[0x7f, 0xff, 0xff, 0xff, 0x7f, 0xff, 0xff, 0xff]);
-    assert!(read(&folder.write("a.png", &big), false).is_err());
+    for (name, bytes, what) in [
+        ("a.png", hollow_png(::png::ColorType::Rgb, [0x7fff_ffff, 1]), "at most 65536 each way"),
+        ("a.png", hollow_png(::png::ColorType::Rgb, [60_000, 60_000]), "134217728 in all are read: make it smaller"),
+        ("a.png", hollow_png(::png::ColorType::Rgb, [16_384, 8192]), "claims 402653184 bytes of texels"),
+        ("a.png", hollow_png(::png::ColorType::Grayscale, [16_384, 8192]), "claims 134217728 bytes of texels"),
+        ("a.jpg", jpeg_of(60_000, 60_000), "134217728 in all are read: make it smaller"),
+        ("a.jpg", jpeg_of(16_384, 8192), "claims 402653184 bytes of texels"),
+    ] {
+        let path = folder.write(name, &bytes);
+        for error in [header(&path, false).unwrap_err(), read(&path, false).unwrap_err()] {
+            assert!(error.contains(what), "{name}: {error}");
+            assert!(error.contains("make it smaller") || error.contains("get it again, or save it anew"), "{error}");
+        }
+    }
     let big = b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 60000 +X 60000\n";
     assert!(header(&folder.write("a.hdr", big), false).unwrap_err().contains("at most"));
     let big = b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 10000 +X 10000\n";
@@ -201,6 +231,9 @@ fn sizes_that_lie() {
     let at = big.windows(10).position(|w| w == b"dataWindow").unwrap() + 10 + 1 + 6 + 4;
     big[at + 8..at + 12].copy_from_slice(&((1i32 << 30) - 1).to_le_bytes());
     assert!(read(&folder.write("a.exr", &big), false).is_err());
+    let flat = png(::png::ColorType::Indexed, ::png::BitDepth::One, [1024, 64], &[0; 128 * 64]);
+    let texels = read(&folder.write("a.png", &flat), false).unwrap().bytes.len();
+    assert!(texels > 500 * flat.len(), "what deflate makes much of is no lie: {texels} of {}", flat.len());
     if let (Some(before), Some(after)) = (before, mutation::peak_memory()) {
         assert!(after.saturating_sub(before) < 128 << 10, "{} KiB more", after - before);
     }
