@@ -42,10 +42,10 @@ pub enum ImportError {
     #[error("{} unsupported element(s), for which --substitute takes stand-ins:\n{}", .0.len(), list(.0))]
     Unsupported(Vec<(Place, String)>),
     /// A limit was passed before memory was taken.
-    #[error("{file}: {message}", file = path.display())]
+    #[error("{place}: {message}")]
     Limit {
-        /// The file.
-        path: PathBuf,
+        /// Where, or the file.
+        place: Place,
         /// Which limit, and how to raise it.
         message: String,
     },

@@ -19,7 +19,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use march::{Cursor, Grid, Slab, Slice};
 
 use crate::ImportError;
-use crate::description::Affine;
+use crate::description::{Affine, Place};
 use crate::import::volume::{self, Slices, VolumeFile};
 use crate::record::{Record, RecordSource, RecordStream, TriangleRecord};
 
@@ -37,7 +37,7 @@ impl IsoSurfaceSource {
     /// Opens the volume at `path` (see [`volume::open`]) and checks it. `iso` is in rescaled units (HU for CT).
     pub fn new(path: &Path, iso: f64) -> Result<Self, ImportError> {
         let file = volume::open(path)?;
-        let limit = |message| Err(ImportError::Limit { path: path.to_owned(), message });
+        let limit = |message| Err(ImportError::Limit { place: Place::file(path), message });
         if !iso.is_finite() {
             return limit(format!("the surface's value {iso} is not a number that samples can pass through"));
         }

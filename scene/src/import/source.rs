@@ -171,7 +171,7 @@ impl Source {
 
     /// An error about a limit.
     pub fn fail_limit<T>(&self, message: impl Into<String>) -> Result<T, ImportError> {
-        Err(ImportError::Limit { path: self.path.clone(), message: message.into() })
+        Err(ImportError::Limit { place: Place::file(&self.path), message: message.into() })
     }
 
     /// Wraps an error of the operating system.

@@ -2,11 +2,11 @@
 
 use std::collections::BTreeSet;
 use std::fs;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::time::UNIX_EPOCH;
 
 use crate::ImportError;
-use crate::description::{Description, Environment, Geometry, TextureKind};
+use crate::description::{Description, Environment, Geometry, Place, TextureKind};
 use crate::objects::ObjectHash;
 
 /// Fingerprint of a source: the hash of its description, but for what [`crate::manifest::Defaults`] holds of it, and, for every file it names (for a folder: every file in
@@ -30,7 +30,7 @@ pub fn fingerprint(description: &Description) -> Result<ObjectHash, ImportError>
         ..description.clone()
     };
     hasher.update(&serde_json::to_vec(&scene).map_err(|e| ImportError::Limit {
-        path: PathBuf::new(),
+        place: Place::default(),
         message: format!("the description cannot be written down: {e}"),
     })?);
     for file in source_files(description) {

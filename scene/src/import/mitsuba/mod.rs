@@ -236,7 +236,7 @@ impl<'a> Converter<'a> {
         let o = &self.document.objects[object];
         if !self.open.insert(object) {
             let name = o.id.clone().unwrap_or_else(|| o.plugin.clone());
-            return malformed(from, format!("references form a cycle through \"{name}\""));
+            return malformed(from, format!("references form a cycle through \"{name}\": take this one out of it"));
         }
         if self.open.len() > MAX_NESTING {
             return malformed(from, format!("references nested deeper than {MAX_NESTING}: put less between the ends"));
@@ -244,10 +244,10 @@ impl<'a> Converter<'a> {
         self.entered += 1;
         if self.entered > MAX_OBJECTS || self.out.materials.len() > MAX_MATERIALS {
             let message = format!(
-                "more than {MAX_OBJECTS} objects or {MAX_MATERIALS} materials, each counted as often as it is referred to: this is no \
-                 scene that can be read"
+                "more than {MAX_OBJECTS} objects or {MAX_MATERIALS} materials, each counted as often as it is referred to: let less \
+                 refer to what refers to others"
             );
-            return Err(ImportError::Limit { path: from.file.clone(), message });
+            return Err(ImportError::Limit { place: from.clone(), message });
         }
         Ok(())
     }
@@ -290,6 +290,8 @@ fn shorten(text: &str) -> String {
 mod composed_tests;
 #[cfg(test)]
 mod daylight_tests;
+#[cfg(test)]
+mod document_tests;
 #[cfg(test)]
 mod emitter_tests;
 #[cfg(test)]

@@ -35,7 +35,12 @@ impl Converter<'_> {
             if let Some(n) = self.integer(sampler, "sample_count")? {
                 match u32::try_from(n) {
                     Ok(n) if n > 0 => self.out.spp = Some(n),
-                    _ => return malformed(&self.document.objects[sampler].place, "sample_count should be at least 1"),
+                    _ => {
+                        return malformed(
+                            self.place_of(sampler, "sample_count"),
+                            format!("sample_count {n} should be at least 1"),
+                        );
+                    }
                 }
             }
             self.ignore(sampler, &["seed", "jitter", "scramble", "dimension"]);
@@ -60,7 +65,10 @@ impl Converter<'_> {
         };
         let to_world = self.transform(id, "to_world")?;
         if to_world.determinant() == 0.0 || !to_world.determinant().is_finite() {
-            return malformed(place, "the sensor's to_world is singular");
+            return malformed(
+                self.place_of(id, "to_world"),
+                "the sensor's to_world is singular, so that it looks nowhere: leave out the scale of 0, or give it a lookat",
+            );
         }
         self.out.camera = Some(Camera { to_world, projection, crop });
         self.ignore(id, &["focus_distance"]);
@@ -68,7 +76,8 @@ impl Converter<'_> {
         self.pass_over(id, &["shutter_open", "shutter_close"], "nothing moves while the shutter is open");
         for name in ["principal_point_offset_x", "principal_point_offset_y"] {
             if self.float(id, name)?.is_some_and(|v| v != 0.0) {
-                self.unsupported(place, name, "0");
+                let at = self.place_of(id, name).clone();
+                self.unsupported(&at, name, "0");
             }
         }
         self.leave(id);
@@ -145,7 +154,10 @@ impl Converter<'_> {
         for (slot, name) in size.iter_mut().zip(["width", "height"]) {
             if let Some(n) = self.integer(id, name)? {
                 if !(1..=MAX_SIDE).contains(&n) {
-                    return malformed(place, format!("{name} {n} should lie between 1 and {MAX_SIDE}"));
+                    return malformed(
+                        self.place_of(id, name),
+                        format!("{name} {n} should lie between 1 and {MAX_SIDE}"),
+                    );
                 }
                 *slot = n as u32;
             }

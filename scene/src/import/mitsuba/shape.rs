@@ -35,9 +35,9 @@ impl Converter<'_> {
         let mut to_world = outer.after(&self.transform(id, "to_world")?);
         if self.out.shapes.len() >= MAX_SHAPES {
             let message = format!(
-                "more than {MAX_SHAPES} shapes, instances counted one by one: this is no scene that can be read"
+                "more than {MAX_SHAPES} shapes, instances counted one by one: join what stands together into one mesh"
             );
-            return Err(ImportError::Limit { path: place.file.clone(), message });
+            return Err(ImportError::Limit { place: place.clone(), message });
         }
         if !to_world.determinant().is_finite() {
             return malformed(place, "to_world is too large for floating point");
@@ -101,6 +101,9 @@ impl Converter<'_> {
             self.out.bytes_read += head.bytes_read;
             if head.libraries && bsdfs.is_empty() {
                 self.note(place, "this obj names materials of its own (mtllib), which are not read in an XML scene: it is grey; put a bsdf into the shape");
+            }
+            if head.libraries && !bsdfs.is_empty() && self.document.old {
+                self.note(place, "this obj names materials of its own (mtllib), which 0.5 and 0.6 gave to its parts: here the shape's bsdf counts, as in Mitsuba 3");
             }
             if bsdfs.is_empty() {
                 head.looks.iter().for_each(|text| self.note(place, *text));

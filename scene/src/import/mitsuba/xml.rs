@@ -84,6 +84,8 @@ pub(super) struct Document {
     pub unknown: Vec<(Place, String)>,
     /// The canonical folder of the scene: no file outside is read.
     pub folder: PathBuf,
+    /// Folders inside of it in which files are looked for first (`<path>`), the last named foremost, as in Mitsuba.
+    paths: Vec<PathBuf>,
     /// Whether its version is below 2 (0.5 or 0.6), where some things mean something else.
     pub old: bool,
     /// Bytes of XML read.
@@ -103,6 +105,7 @@ impl Document {
                 ids: BTreeMap::new(),
                 unknown: vec![],
                 folder,
+                paths: vec![],
                 old: false,
                 bytes_read: 0,
             },
@@ -131,8 +134,11 @@ impl Document {
         }
     }
 
-    /// Where a file that the scene names may be: relative to the file that names it, or to the scene.
+    /// Where a file that the scene names may be: in a `<path>`, or relative to the file that names it, or to the scene.
     fn path(&self, name: &str, place: &Place) -> PathBuf {
+        if let Some(found) = self.paths.iter().rev().map(|folder| folder.join(name)).find(|path| path.exists()) {
+            return found;
+        }
         let beside = place.file.parent().unwrap_or(Path::new("")).join(name);
         if beside.exists() { beside } else { self.folder.join(name) }
     }
@@ -275,7 +281,7 @@ impl Reader {
         if metadata.len().max(text.len() as u64) > left {
             let message =
                 format!("more than {MAX_BYTES} bytes of XML with its includes: keep meshes in files of their own");
-            return Err(ImportError::Limit { path: path.into(), message });
+            return Err(ImportError::Limit { place: Place::file(path), message });
         }
         self.document.bytes_read += text.len() as u64;
         let whole = |message: String| ImportError::Malformed { place: Place::file(path), message };
@@ -285,14 +291,30 @@ impl Reader {
         let text = text.strip_prefix('\u{feff}').unwrap_or(&text);
         if let Some(offset) = crowded_element(text) {
             let place = Lines::of(text).place(path, offset.saturating_sub(1));
-            return malformed(&place, format!("an element with more than {MAX_ATTRIBUTES} attributes"));
+            return malformed(
+                &place,
+                format!("an element with more than {MAX_ATTRIBUTES} attributes: it is damaged, get the file again"),
+            );
         }
         let options = roxmltree::ParsingOptions { nodes_limit: MAX_NODES, ..Default::default() };
-        let xml = roxmltree::Document::parse_with_options(text, options).map_err(|e| ImportError::Malformed {
-            place: Place { file: path.into(), line: e.pos().row, column: e.pos().col },
-            message: format!("not well-formed XML: {e}"),
-        })?;
         let lines = Lines::of(text);
+        let xml = roxmltree::Document::parse_with_options(text, options).map_err(|e| match e {
+            // the parser says no place of it
+            roxmltree::Error::DtdDetected => ImportError::Malformed {
+                place: lines.place(path, after_prolog(text)),
+                message: "a DOCTYPE is not read, as its entities may stand for text without bound: take it out, and write what \
+                          they stand for (or a <default>) in their places"
+                    .to_owned(),
+            },
+            roxmltree::Error::NodesLimitReached => ImportError::Limit {
+                place: Place::file(path),
+                message: format!("more than {MAX_NODES} elements and texts between them: keep meshes in files of their own"),
+            },
+            e => ImportError::Malformed {
+                place: Place { file: path.into(), line: e.pos().row, column: e.pos().col },
+                message: format!("not well-formed XML: {e}"),
+            },
+        })?;
         let place = |node: &roxmltree::Node| lines.place(path, node.range().start);
 
         self.including.push(canonical.to_path_buf());
@@ -340,7 +362,9 @@ impl Reader {
         place: &dyn Fn(&roxmltree::Node) -> Place,
     ) -> Result<(), ImportError> {
         if depth > MAX_DEPTH {
-            return malformed(&place(&node), format!("elements nested deeper than {MAX_DEPTH}"));
+            let message =
+                format!("elements nested deeper than {MAX_DEPTH}: give them ids, put them side by side and use <ref>");
+            return malformed(&place(&node), message);
         }
         for child in node.children().filter(|n| n.is_element()) {
             self.element(child, parent, depth, parameters, place)?;
@@ -370,6 +394,14 @@ impl Reader {
                 return Ok(());
             }
             "include" => return self.include(&element, parent, depth, name, parameters),
+            "path" => {
+                let folder = self.document.resolve(element.need("value")?, &place)?;
+                if !folder.is_dir() {
+                    return malformed(&place, "<path> should name a folder");
+                }
+                self.document.paths.push(folder);
+                return Ok(());
+            }
             "alias" => {
                 let (id, alias) = (element.need("id")?, element.need("as")?);
                 let Some(&target) = self.document.ids.get(id) else {
@@ -447,11 +479,16 @@ impl Reader {
         let path = self.document.resolve(element.need("filename")?, &element.place)?;
         if let Some(start) = self.including.iter().position(|p| *p == path) {
             let cycle: Vec<String> = self.including[start..].iter().chain([&path]).map(|p| file_name(p)).collect();
-            return malformed(&element.place, format!("includes form a cycle: {}", cycle.join(" -> ")));
+            return malformed(
+                &element.place,
+                format!("includes form a cycle: {}; take one of these <include>s out", cycle.join(" -> ")),
+            );
         }
         self.includes += 1;
         if self.includes > MAX_INCLUDES || self.including.len() > MAX_DEPTH {
-            return malformed(&element.place, format!("more than {MAX_INCLUDES} includes, or deeper than {MAX_DEPTH}"));
+            let message =
+                format!("more than {MAX_INCLUDES} includes, or deeper than {MAX_DEPTH}: join some of the files");
+            return malformed(&element.place, message);
         }
         self.file(&path.clone(), &path, Some((parent, depth + 1, name)), parameters)
     }
@@ -487,6 +524,18 @@ fn read_element<'a, 'input>(
         attributes.insert(attribute.name(), parameters.substitute(attribute.value(), place)?);
     }
     Ok(Element { node, place: place.clone(), attributes })
+}
+
+/// Offset of what follows the declaration, comments and instructions at the start.
+fn after_prolog(text: &str) -> usize {
+    let mut rest = text.trim_start();
+    while let Some(end) = [("<!--", "-->"), ("<?", "?>")].iter().find_map(|(start, end)| {
+        let at = rest.strip_prefix(start)?.find(end)?;
+        Some(start.len() + at + end.len())
+    }) {
+        rest = rest[end..].trim_start();
+    }
+    text.len() - rest.len()
 }
 
 /// Offset of a stretch without `<` that has too many `=`; an element's attributes lie in such a stretch.

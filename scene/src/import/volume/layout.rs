@@ -4,6 +4,7 @@ use std::path::{Path, PathBuf};
 
 use super::{MAX_SLICE_SAMPLES, malformed};
 use crate::ImportError;
+use crate::description::Place;
 
 /// How a sample is stored.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -113,7 +114,7 @@ pub(super) fn check_dims(path: &Path, line: u32, dims: [u64; 3]) -> Result<[usiz
     match dims[0].checked_mul(dims[1]) {
         Some(n) if n <= MAX_SLICE_SAMPLES && dims[2] <= u64::from(u32::MAX) => Ok(dims.map(|d| d as usize)),
         _ => Err(ImportError::Limit {
-            path: path.to_owned(),
+            place: Place::line(path, line),
             message: format!(
                 "the header says {} x {} x {} samples; a slice may have {MAX_SLICE_SAMPLES}: crop or resample it first",
                 dims[0], dims[1], dims[2]

@@ -7,7 +7,7 @@ use super::layout::{Layout, Part, Skip, check_dims};
 use super::slices::{Bytes, Counted};
 use super::{SampleType, Volume, malformed};
 use crate::ImportError;
-use crate::description::Affine;
+use crate::description::{Affine, Place};
 
 /// Longest header: room for a list of many thousand files.
 const MAX_HEADER: u64 = 1 << 20;
@@ -74,7 +74,7 @@ pub(super) fn open(path: &Path, bytes: &Bytes) -> Result<(Volume, Layout), Impor
         line += 1;
         if used > MAX_HEADER {
             return Err(ImportError::Limit {
-                path: path.to_owned(),
+                place: Place::line(path, line),
                 message: format!("the header has more than {MAX_HEADER} bytes"),
             });
         }
