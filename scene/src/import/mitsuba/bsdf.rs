@@ -330,7 +330,17 @@ impl Converter<'_> {
             }),
             _ => None,
         };
-        // Mitsuba's default: a perfect mirror
+        if self.document.old && material.is_none() && (eta.is_none() || k.is_none()) {
+            let plugin = &self.document.objects[id].plugin;
+            self.note(
+                place,
+                format!(
+                    "{plugin} without a material is a perfect mirror, as Mitsuba 3 reads it; 0.5 and 0.6 made it of copper: write material \
+                     \"Cu\" for that, or \"none\" for the mirror"
+                ),
+            );
+        }
+        // Mitsuba 3's default: a perfect mirror
         let (eta_of, k_of) = named.unwrap_or(([0.0; 3], [1.0; 3]));
         let (eta, k) = (eta.unwrap_or(eta_of), k.unwrap_or(k_of));
         if !eta.iter().chain(&k).all(|v| (0.0..=LARGEST_INDEX).contains(v)) {

@@ -5,7 +5,7 @@ use super::daylight::Daylight;
 use super::shape::is_similarity;
 use super::xml::{ObjectId, malformed};
 use crate::ImportError;
-use crate::description::{Affine, Beam, Environment, Place, Slide};
+use crate::description::{Affine, Beam, Environment, Place, Slide, TextureKind};
 use crate::import::vector::{cofactors, normalize};
 
 impl Converter<'_> {
@@ -157,6 +157,13 @@ impl Converter<'_> {
                 let position = finite(map.point([0.0; 3]))?;
                 let textured = match self.property(id, "texture") {
                     Some(p) => match self.texture_of(p, "no picture")? {
+                        // a lamp has no mesh
+                        Some(Some(n))
+                            if matches!(self.out.textures[n as usize].kind, TextureKind::Attribute { .. }) =>
+                        {
+                            self.unsupported(&p.place, "mesh_attribute as the texture of a spot", "no picture");
+                            None
+                        }
                         Some(number) => number,
                         None => {
                             self.unsupported(&p.place, "this texture of a spot", "no picture");

@@ -32,6 +32,16 @@ fn what_changes_nothing_has_a_note() {
             "s.xml:3: light_image of integrator \"bdpt\"",
         ),
         (integrator("type='direct'><integer name='max_depth' value='5'/>"), "s.xml:3: integrator \"direct\""),
+        (
+            integrator(
+                "type='direct'><integer name='emitter_samples' value='4'/><integer name='bsdf_samples' value='2'/>",
+            ),
+            "s.xml:3: emitter_samples, bsdf_samples of integrator \"direct\"",
+        ),
+        (
+            integrator("type='direct'><integer name='shading_samples' value='4'/>"),
+            "s.xml:3: shading_samples of integrator",
+        ),
         (integrator("type='path'><integer name='max_depth' value='-1'/>"), "s.xml:3: max_depth -1"),
         (
             bsdf(
@@ -80,6 +90,16 @@ fn what_would_change_the_picture_is_refused() {
         ),
         (film("<film type='hdrfilm'/><film type='hdrfilm'/>"), "s.xml:3: a second film"),
         (film("<sampler type='independent'/><sampler type='stratified'/>"), "s.xml:3: a second sampler"),
+        (
+            film("<sampler type='independent'>\n<integer name='sample_count' value='0'/></sampler>"),
+            "s.xml:4: sample_count 0 should be at least 1",
+        ),
+        (film("\n<float name='principal_point_offset_x' value='0.1'/>"), "s.xml:4: principal_point_offset_x"),
+        (film("\n<float name='principal_point_offset_y' value='-0.1'/>"), "s.xml:4: principal_point_offset_y"),
+        (
+            bsdf("<bsdf type='roughconductor'>\n<string name='distribution' value='phong'/></bsdf>"),
+            "s.xml:4: distribution \"phong\"",
+        ),
         (film("<film type='hdrfilm'><rfilter type='box'/><rfilter type='tent'/></film>"), "s.xml:3: a second rfilter"),
         (format!("{CUBE}<integrator type='path'/>\n<integrator type='path'/>"), "s.xml:3: a second integrator"),
         (
@@ -139,22 +159,49 @@ fn numbers_of_colours_and_values_beside_names() {
         let text =
             format!("<scene version='{version}'><shape type='cube'>{text}</shape><emitter type='constant'/></scene>");
         let out = import(&write(&dir, "s.xml", text), &ImportOptions::default()).unwrap();
-        (out.materials[0].bsdf.clone(), out.notes.len())
+        (out.materials[0].bsdf.clone(), out.notes.iter().map(|n| n.text.clone()).collect::<Vec<_>>())
     };
+    let [gold, eta] = ["<string name='material' value='Au'/>", "<spectrum name='eta' value='1.5'/>"];
+    let k = "<spectrum name='k' value='2'/>";
+    let metal = |inside: &str, version: &str| of(&format!("<bsdf type='conductor'>{inside}</bsdf>"), version);
     let rough = "<bsdf type='roughconductor'><rgb name='alpha' value='0.1, 0.2, 0.3'/></bsdf>";
-    let (Bsdf::RoughConductor { alpha, .. }, 0) = of(rough, "3.0.0") else { panic!() };
+    let (Bsdf::RoughConductor { alpha, .. }, notes) = of(rough, "3.0.0") else { panic!() };
+    assert!(notes.is_empty(), "{notes:?}");
     assert!((alpha[0] - (0.2126 * 0.1 + 0.7152 * 0.2 + 0.0722 * 0.3)).abs() < 1e-6, "{alpha:?}");
-    let metal = |inside: &str| format!("<bsdf type='conductor'><string name='material' value='Au'/>{inside}</bsdf>");
-    let (Bsdf::Conductor { eta: gold, k, .. }, 0) = of(&metal(""), "0.6.0") else { panic!() };
-    let eta = "<spectrum name='eta' value='1.5'/>";
-    let (Bsdf::Conductor { eta: given, k: other, .. }, 0) = of(&metal(eta), "0.6.0") else { panic!() };
-    assert!(given == [1.5; 3] && gold != given && other == k, "the name says what no value does");
-    let (Bsdf::Conductor { eta: given, k: other, .. }, 1) =
-        of(&metal(&format!("{eta}<spectrum name='k' value='2'/>")), "0.6.0")
-    else {
-        panic!("no note")
+    let (Bsdf::Conductor { eta: of_gold, k: other, .. }, _) = metal(gold, "0.6.0") else { panic!() };
+    let (Bsdf::Conductor { eta: given, k: kept, .. }, notes) = metal(&format!("{gold}{eta}"), "0.6.0") else {
+        panic!()
+    };
+    assert!(
+        notes.is_empty() && given == [1.5; 3] && of_gold != given && other == kept,
+        "the name says what no value does"
+    );
+    let (Bsdf::Conductor { eta: given, k: other, .. }, notes) = metal(&format!("{gold}{eta}{k}"), "0.6.0") else {
+        panic!()
     };
     assert_eq!((given, other), ([1.5; 3], [2.0; 3]));
+    assert!(notes.len() == 1 && notes[0].contains("\"Au\" is passed over"), "{notes:?}");
+
+    // without either: Mitsuba 3's mirror in all versions, of which the old are told
+    let mirror = metal("", "3.0.0");
+    assert_eq!(mirror, (Bsdf::Conductor { eta: [0.0; 3], k: [1.0; 3], specular: [1.0; 3] }, vec![]));
+    let none = "<string name='material' value='none'/>";
+    for (inside, version, told) in [
+        ("", "0.6.0", true),
+        ("", "0.5.0", true),
+        (eta, "0.6.0", true),
+        (none, "0.6.0", false),
+        (&format!("{eta}{k}"), "0.6.0", false),
+        (gold, "0.6.0", false),
+        ("", "2.0.0", false),
+        (eta, "3.0.0", false),
+    ] {
+        let (found, notes) = metal(inside, version);
+        assert!(!inside.is_empty() || found == mirror.0, "{found:?}");
+        let what = "conductor without a material is a perfect mirror, as Mitsuba 3 reads it; 0.5 and 0.6 made it of copper: write material \"Cu\"";
+        assert_eq!(notes.iter().any(|n| n.starts_with(what)), told, "{inside} in {version}: {notes:?}");
+        assert_eq!(notes.len(), usize::from(told), "{notes:?}");
+    }
 }
 
 /// What meshes have, and a shape without a material of its own does not use.
@@ -194,21 +241,24 @@ fn materials_and_colours_of_meshes_have_notes() {
         ("plain.ply", ""),
     ] {
         let kind = file.rsplit('.').next().unwrap();
-        let read = |bsdf: &str| {
+        let read = |version: &str, bsdf: &str| {
             let text = format!(
-                "<scene version='3.0.0'><emitter type='constant'/>\n<shape type='{kind}'><string name='filename' value='{file}'/>{bsdf}\
+                "<scene version='{version}'><emitter type='constant'/>\n<shape type='{kind}'><string name='filename' value='{file}'/>{bsdf}\
                  </shape></scene>"
             );
             let notes = import(&write(&dir, "s.xml", text), &ImportOptions::default()).unwrap().notes;
             notes.iter().map(|n| format!("{}: {}", n.place, n.text)).collect::<String>()
         };
-        let found = read("");
+        let found = read("3.0.0", "");
         if part.is_empty() {
             assert_eq!(found, "", "{file}");
         } else {
             assert!(found.contains("s.xml:2:1: ") && found.contains(part), "{file}: {found:?}");
         }
-        assert_eq!(read("<bsdf type='diffuse'/>"), "", "{file} with a material of its own");
+        assert_eq!(read("3.0.0", "<bsdf type='diffuse'/>"), "", "{file} with a material of its own");
+        // which counted for less in 0.5 and 0.6
+        let old = read("0.6.0", "<bsdf type='diffuse'/>");
+        assert_eq!(old.contains("0.5 and 0.6 gave to its parts"), file == "lib.obj", "{file}: {old:?}");
         // of a bare mesh colours are all the same, but a PLY's, which are read
         if file != "c.ply" && file != "lib.obj" {
             let notes = import(&dir.path().join(file), &ImportOptions::default()).unwrap().notes;

@@ -117,6 +117,12 @@ impl Converter<'_> {
                     );
                 }
                 (self.out.max_depth, self.out.rr_depth) = (Some(2), None);
+                let names = ["emitter_samples", "bsdf_samples", "shading_samples"];
+                self.pass_over(
+                    id,
+                    &names,
+                    "a sample of a pixel is one path, whose two kinds of sample are weighed against each other",
+                );
             }
             plugin => {
                 self.unsupported(place, format!("integrator \"{plugin}\""), "path tracing");

@@ -227,6 +227,7 @@ fn what_is_missing_or_wrong_is_listed() {
         ("<bsdf type=\"diffuse\"><texture type=\"bitmap\" name=\"reflectance\"/></bsdf>".into(), "lacks its filename"),
         ("<bsdf type=\"diffuse\"><texture type=\"bitmap\" name=\"reflectance\"><string name=\"filename\" value=\"../../etc/passwd\"/></texture></bsdf>".into(), "etc/passwd"),
         (format!("<bsdf type=\"roughplastic\">{}</bsdf>", bitmap("alpha", "")), "alpha of a roughplastic"),
+        (format!("<bsdf type=\"diffuse\"><texture type=\"checkerboard\" name=\"reflectance\">{}</texture></bsdf>", bitmap("color0", "")), "texture \"bitmap\" for \"color0\""),
         (format!("<bsdf type=\"mask\"><float name=\"opacity\" value=\"1.5\"/>{grey}</bsdf>"), "[0, 1]"),
         ("<bsdf type=\"mask\"/>".into(), "one material inside"),
         (format!("<bsdf type=\"bumpmap\">{grey}</bsdf>"), "needs a texture"),
@@ -300,6 +301,10 @@ fn attributes_are_what_the_mesh_is_read_for() {
         ),
         (mesh("m.ply", &two), "mesh attribute \"face_heat\" beside \"vertex_color\" on one shape"),
         (mesh("m.ply", &bump), "mesh_attribute as a bumpmap"),
+        (
+            format!("{}<emitter type=\"spot\">\n{}</emitter>", mesh("m.ply", ""), attribute("texture", "vertex_color")),
+            "s.xml:4:1: mesh_attribute as the texture of a spot",
+        ),
     ] {
         let error = with_mesh(&scene, false).unwrap_err().to_string();
         assert!(error.contains(what), "{error}");
