@@ -135,6 +135,113 @@ mod tests {
         assert!(p.iter().all(|p| (p[0].hypot(p[1]) - 1.0).abs() < 1.9e-5));
     }
 
+    /// Middles of the triangles of a shape, and their texture coordinates.
+    fn middles(geometry: Geometry) -> Vec<([f64; 3], [f64; 2])> {
+        let (p, _, uv, triangles) = parts(geometry);
+        let mean = |of: [f64; 3]| of.iter().sum::<f64>() / 3.0;
+        let of = |t: &[u32; 3]| {
+            let t = t.map(|i| i as usize);
+            let middle = std::array::from_fn(|axis| mean(t.map(|i| p[i][axis])));
+            (middle, std::array::from_fn(|k| mean(t.map(|i| f64::from(uv[i][k])))))
+        };
+        triangles.iter().map(of).collect()
+    }
+
+    /// How far an angle in turns is from that of a point; f32 has seven digits of it.
+    fn off(turns: f64, [x, y]: [f64; 2]) -> f64 {
+        let difference = (turns - libm::atan2(y, x) / (2.0 * PI)).rem_euclid(1.0);
+        difference.min(1.0 - difference)
+    }
+
+    /// As of Mitsuba 3.9.1's `vertex_texcoords`: of each face u and v by the two axes along it.
+    #[test]
+    fn each_face_of_a_cube_has_the_whole_square() {
+        let found = middles(cube());
+        for (at, [u, v]) in &found {
+            let axis = (0..3).find(|&a| at[a].abs() == 1.0).unwrap();
+            // from 0 to 1 along each axis, and against it
+            let along = at.map(|x| 0.5 + 0.5 * x);
+            let against = at.map(|x| 0.5 - 0.5 * x);
+            let expected = match (axis, at[axis] > 0.0) {
+                (0, true) => [along[1], against[2]],
+                (0, false) => [along[1], along[2]],
+                (1, true) => [against[0], against[2]],
+                (1, false) => [along[2], along[0]],
+                (_, true) => [along[1], along[0]],
+                (_, false) => [against[1], along[0]],
+            };
+            assert!((u - expected[0]).abs() < 1e-12 && (v - expected[1]).abs() < 1e-12, "{at:?}: {u} {v}");
+        }
+        assert_eq!(found.len(), 12);
+        let (_, _, uv, _) = parts(cube());
+        for face in uv.chunks(4) {
+            assert!([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [1.0, 1.0]].iter().all(|corner| face.contains(corner)));
+        }
+    }
+
+    /// u is the distance from the centre, v the angle from x in turns; Mitsuba 3.9.1 says (0.5, 0.25) of (0, 0.5) and (0.42426, 0.625) of (-0.3, -0.3).
+    #[test]
+    fn coordinates_of_a_disk_are_polar() {
+        let (p, _, uv, triangles) = parts(disk());
+        for &[_, a, b] in &triangles {
+            for i in [a, b].map(|i| i as usize) {
+                assert!(uv[i][0] == 1.0 && off(uv[i][1].into(), [p[i][0], p[i][1]]) < 1e-7);
+            }
+        }
+        for ([x, y, _], [u, v]) in middles(disk()) {
+            // a side is straight: as much nearer as its middle is
+            assert!((u - x.hypot(y)).abs() < 2.0 * 1.3e-5 && off(v, [x, y]) < 1e-7, "({x}, {y}): {u} {v}");
+        }
+        let at = |x: f64, y: f64| {
+            // of which triangle a point is, and where in it
+            let inside = |&[c, a, b]: &[u32; 3]| {
+                let [a2, b2] = [p[a as usize], p[b as usize]];
+                let all = a2[0] * b2[1] - a2[1] * b2[0];
+                let (s, t) = ((x * b2[1] - y * b2[0]) / all, (a2[0] * y - a2[1] * x) / all);
+                let mix = |k: usize| {
+                    let [c, a, b] = [c, a, b].map(|i| f64::from(uv[i as usize][k]));
+                    (1.0 - s - t) * c + s * a + t * b
+                };
+                (s >= 0.0 && t >= 0.0 && s + t <= 1.0).then(|| [mix(0), mix(1)])
+            };
+            triangles.iter().find_map(inside).unwrap()
+        };
+        let half_a_side = 0.5 / f64::from(SIDES);
+        for (x, y, [u, v]) in [(0.001, 0.5, [0.500001, 0.249682]), (-0.3, -0.3001, [0.424335, 0.625027])] {
+            let found = at(x, y);
+            assert!((found[0] - u).abs() < 2e-5 && (found[1] - v).abs() < half_a_side, "({x}, {y}): {found:?}");
+        }
+    }
+
+    /// u is the angle from x in turns, v the height; Mitsuba 3.9.1 says (0.25, 0.75) of (0, 1, 0.75) and (0.75, 0.1) of (0, -1, 0.1).
+    #[test]
+    fn coordinates_of_a_cylinder_are_angle_and_height() {
+        let (p, _, uv, _) = parts(cylinder());
+        for (p, &[u, v]) in p.iter().zip(&uv) {
+            assert!(off(u.into(), [p[0], p[1]]) < 1e-7 && f64::from(v) == p[2], "{p:?}: {u} {v}");
+        }
+        let quarter = 2 * SIDES as usize / 4;
+        assert!(p[quarter][0].abs() < 1e-12 && p[quarter][1] > 0.99 && uv[quarter] == [0.25, 0.0]);
+        // places on others, and u and v there, by Mitsuba 3.9.1
+        type Ends = [[f64; 3]; 2];
+        let slanted: Ends = [[1.0, 2.0, 3.0], [4.0, -1.0, 5.0]];
+        let down: Ends = [[0.0; 3], [0.0, 0.0, -2.0]];
+        let along_y: Ends = [[1.0, 0.0, 0.0], [1.0, 3.0, 0.0]];
+        for ([p0, p1], place, [u, v]) in [
+            (slanted, [2.2583053, 1.4484214, 3.5851737], [0.11978167, 0.3]),
+            (slanted, [2.2452223, 1.2170753, 3.2577798], [0.98841059, 0.3]),
+            (down, [0.47891313, 0.14367394, -0.6], [0.95361322, 0.3]),
+            (down, [-0.10846519, 0.48809358, -0.6], [0.71519774, 0.3]),
+            (along_y, [1.4902904, 0.9, 0.0980581], [0.96858346, 0.3]),
+            (along_y, [0.9019419, 0.9, -0.49029034], [0.28141651, 0.3]),
+        ] {
+            let (sin, cos) = libm::sincos(2.0 * PI * u);
+            let found = between(p0, p1, 0.5).unwrap().point([cos, sin, v]);
+            // digits of f32
+            assert!((0..3).all(|k| (found[k] - place[k]).abs() < 1e-6), "{p0:?} {p1:?}: {found:?} {place:?}");
+        }
+    }
+
     #[test]
     fn a_cylinder_goes_between_two_points() {
         for (p0, p1) in [([1.0, 2.0, 3.0], [4.0, -1.0, 5.0]), ([0.0; 3], [0.0, 0.0, -2.0]), ([0.0; 3], [0.0, 0.0, 1.0])]
