@@ -27,6 +27,9 @@ const LIT: &str = "<emitter type='constant'/>";
 /// A picture of one texel.
 const HDR: &[u8] = b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 1 +X 1\n\x80\x40\x20\x81";
 
+/// A JPEG of 37 x 29 texels.
+const JPEG: &[u8] = include_bytes!("../../scene/src/image/fixtures/waves.jpg");
+
 /// A folder with the inputs of one table.
 struct Bed(tempfile::TempDir);
 
@@ -178,6 +181,26 @@ fn headers_that_claim_more_than_there_is() {
     nii[70..72].copy_from_slice(&64i16.to_le_bytes());
     nii[344..348].copy_from_slice(b"n+1\0");
     bed.write("huge.nii", nii);
+    // pictures: next to nothing that claims to be 16384 x 8192
+    let mut hollow = vec![];
+    let mut encoder = png::Encoder::new(&mut hollow, 16_384, 8192);
+    encoder.set_color(png::ColorType::Rgb);
+    encoder.write_header().unwrap().write_chunk(png::chunk::IDAT, b"\x78\x9c\x03\0\0\0\0\x01").unwrap();
+    let mut jpeg = JPEG.to_vec();
+    let frame = jpeg.windows(2).position(|w| matches!(w, [0xff, 0xc0 | 0xc2])).unwrap();
+    jpeg[frame + 5..frame + 9].copy_from_slice(&[8192u16.to_be_bytes(), 16_384u16.to_be_bytes()].concat());
+    bed.write("huge.png", &hollow).write("huge.jpg", &jpeg);
+    let texture = |name: &str| {
+        format!(
+            "<shape type='cube'><bsdf type='diffuse'><texture type='bitmap' name='reflectance'>\n <string name='filename' value='{name}'/>\
+             </texture></bsdf></shape>{LIT}"
+        )
+    };
+    bed.xml("png.xml", &texture("huge.png")).xml("jpg.xml", &texture("huge.jpg")).xml(
+        "sky.xml",
+        "<shape type='cube'/>\n  <emitter type='envmap'><string name='filename' value='huge.png'/></emitter>",
+    );
+    let lies = "claims 402653184 bytes of texels in a file of ";
     bed.mistakes(&[
         ("render huge.ply", &["huge.ply", "4000000000000"]),
         ("render beyond.ply", &["beyond.ply:3"]),
@@ -189,6 +212,9 @@ fn headers_that_claim_more_than_there_is() {
         ("render long.nrrd --iso 1", &["long.nrrd", "1048576 bytes"]),
         ("render list.nhdr --iso 1", &["list.nhdr:6", "too many"]),
         ("render huge.nii --iso 1", &["huge.nii", "crop or resample"]),
+        ("render png.xml", &["png.xml:3:2: texture file \"huge.png\"", lies, "get it again"]),
+        ("render jpg.xml", &["jpg.xml:3:2: texture file \"huge.jpg\"", lies, "get it again"]),
+        ("render sky.xml", &["sky.xml:3:3: image ", "huge.png", lies, "get it again"]),
     ]);
 }
 
@@ -209,11 +235,18 @@ fn bombs() {
         })
         .write(
             "entities.xml",
-            "<!DOCTYPE s [<!ENTITY a 'aaaaaaaaaa'><!ENTITY b '&a;&a;&a;&a;&a;&a;&a;&a;'>]>\n<scene version='&b;'/>",
+            "<?xml version='1.0'?>\n <!DOCTYPE s [<!ENTITY a 'aaaaaaaaaa'><!ENTITY b '&a;&a;&a;&a;&a;&a;&a;&a;'>]>\n<scene version='&b;'/>",
         )
         .write(
             "deep.xml",
             "<scene version='3.0.0'>".to_owned() + &"<a>".repeat(1_000_000) + &"</a>".repeat(1_000_000) + "</scene>",
+        )
+        .write(
+            "deep-known.xml",
+            "<scene version='3.0.0'>\n".to_owned()
+                + &"<shape type='cube'><bsdf type='twosided'>".repeat(500_000)
+                + &"</bsdf></shape>".repeat(500_000)
+                + "</scene>",
         )
         .write("deep-shapes.xml", "<scene version='3.0.0'>\n".to_owned() + &"<shape type='cube'>\n".repeat(1_000_000))
         .xml("nested.xml", &("<bsdf type='twosided'>\n".repeat(1000) + &"</bsdf>".repeat(1000)))
@@ -263,15 +296,16 @@ fn bombs() {
         ("render doubling.xml", &["doubling.xml:21", "$a18x", "1048576 bytes", "<default>"]),
         ("render sum.xml", &["sum.xml:1", "$a17x", "67108864 bytes", "shorten the <default>s"]),
         ("render defaults.xml", &["defaults.xml:1", "$a17x", "67108864 bytes"]),
-        ("render entities.xml", &["entities.xml", "not well-formed"]),
-        ("render deep.xml", &["deep.xml:1", "element <a>"]),
-        ("render deep-shapes.xml", &["deep-shapes.xml"]),
-        ("render nested.xml", &["nested.xml:6", "nested deeper than 64"]),
+        ("render entities.xml", &["entities.xml:2:2: a DOCTYPE is not read", "take it out"]),
+        ("render deep.xml", &["deep.xml:1:24: element <a>"]),
+        ("render deep-known.xml", &["deep-known.xml:2:1313: ", "nested deeper than 64", "use <ref>"]),
+        ("render deep-shapes.xml", &["deep-shapes.xml:1:1: ", "never closed"]),
+        ("render nested.xml", &["nested.xml:66:1: ", "nested deeper than 64", "use <ref>"]),
         ("render chain.xml", &["chain.xml:", "references nested deeper than 64"]),
         ("render groups.xml", &["groups.xml:", "references nested deeper than 64"]),
-        ("render blends.xml", &["blends.xml", "262144 materials"]),
-        ("render empty.xml", &["empty.xml", "4194304 objects"]),
-        ("render wide.xml", &["wide.xml", "10000 attributes"]),
+        ("render blends.xml", &["blends.xml:5:46: ", "262144 materials", "let less refer"]),
+        ("render empty.xml", &["empty.xml:3:124: ", "4194304 objects", "let less refer"]),
+        ("render wide.xml", &["wide.xml:2:1: ", "10000 attributes", "get the file again"]),
         ("render line.obj.gz", &["line.obj.gz:5", "longer than"]),
         ("render word.stl.gz", &["word.stl.gz"]),
         ("render word.ply.gz", &["word.ply.gz"]),
@@ -326,13 +360,16 @@ fn cycles_and_references_to_nothing() {
     };
     bed.write("beyond.ply", ply("3")).write("minus.ply", ply("-1"));
     bed.mistakes(&[
-        ("render self.xml", &["self.xml:2", "cycle: self.xml -> self.xml"]),
-        ("render one.xml", &["two.xml:2", "cycle: one.xml -> two.xml -> one.xml"]),
-        ("render ref.xml", &["ref.xml:2", "cycle"]),
-        ("render pair.xml", &["pair.xml", "cycle"]),
-        ("render group.xml", &["group.xml:3", "cycle through \"g\""]),
-        ("render nothing.xml", &["nothing.xml:3", "ref to \"no\"", "nothing in the scene has this id"]),
-        ("render twice.xml", &["twice.xml:3", "id \"m\" is taken", "its own"]),
+        ("render self.xml", &["self.xml:2:1: ", "cycle: self.xml -> self.xml", "take one of these <include>s out"]),
+        (
+            "render one.xml",
+            &["two.xml:2:1: ", "cycle: one.xml -> two.xml -> one.xml", "take one of these <include>s out"],
+        ),
+        ("render ref.xml", &["ref.xml:2:30: ", "cycle through \"m\": take this one out"]),
+        ("render pair.xml", &["pair.xml:3:1: ", "cycle through \"a\": take this one out"]),
+        ("render group.xml", &["group.xml:3:24: ", "cycle through \"g\": take this one out"]),
+        ("render nothing.xml", &["nothing.xml:3:1: ", "ref to \"no\"", "nothing in the scene has this id"]),
+        ("render twice.xml", &["twice.xml:3:1: ", "id \"m\" is taken", "its own"]),
         ("render beyond.obj", &["beyond.obj:5:7: index 4 of v, but 3", "a face names what stands before it"]),
         ("render zero.obj", &["zero.obj:4:3: index 0"]),
         ("render back.obj", &["back.obj:4:9: index -4"]),
@@ -347,8 +384,13 @@ fn nothing_to_see_or_to_see_by() {
     let bed = Bed::new();
     let film = |n: u32| {
         format!(
-            "<sensor type='perspective'><film type='hdrfilm'><integer name='width' value='{n}'/><integer name='height' value='{n}'/>\
+            "<sensor type='perspective'><film type='hdrfilm'>\n <integer name='width' value='{n}'/><integer name='height' value='{n}'/>\
              </film></sensor><shape type='cube'/>{LIT}"
+        )
+    };
+    let lamp = |kind: &str, file: &str, more: &str| {
+        format!(
+            "<shape type='cube'/>\n  <shape type='{kind}' id='lamp'><string name='filename' value='{file}'/><emitter type='area'/></shape>{more}"
         )
     };
     let rough = |alpha: &str| {
@@ -369,6 +411,10 @@ fn nothing_to_see_or_to_see_by() {
             &format!("<shape type='cube'>\n<transform name='to_world'><scale value='0'/></transform></shape>{LIT}"),
         )
         .xml(
+            "flat-seen.xml",
+            &format!("<sensor type='perspective'/>\n <shape type='cube'><transform name='to_world'><scale value='0'/></transform></shape>{LIT}"),
+        )
+        .xml(
             "nan.xml",
             &format!("<shape type='cube'>\n<transform name='to_world'><scale value='nan'/></transform></shape>{LIT}"),
         )
@@ -384,6 +430,17 @@ fn nothing_to_see_or_to_see_by() {
             "<shape type='cube'/><shape type='rectangle' id='lamp'>\n<transform name='to_world'><scale x='0'/></transform>\
              <emitter type='area'/></shape>"
         })
+        .xml("flat-sensor.xml", &format!("<shape type='cube'/><sensor type='perspective'>\n <transform name='to_world'><scale z='0'/></transform></sensor>{LIT}"))
+        // a lamp of vertices that are none, and one of no triangles
+        .write("nan-lamp.obj", "v nan 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+        .write("no-lamp.ply", "ply\nformat ascii 1.0\nelement vertex 0\nproperty float x\nproperty float y\nproperty float z\nelement face 0\n\
+            property list uchar int vertex_indices\nend_header\n")
+        .xml("nan-lamp.xml", &lamp("obj", "nan-lamp.obj", ""))
+        .xml("no-lamp.xml", &lamp("ply", "no-lamp.ply", ""))
+        .xml("nan-lamp-lit.xml", &lamp("obj", "nan-lamp.obj", LIT))
+        .xml("no-lamp-lit.xml", &lamp("ply", "no-lamp.ply", "<shape type='sphere'><emitter type='area'/></shape>"))
+        .xml("flat-lamp-lit.xml", &format!("{}{LIT}", "<shape type='cube'/>\n<shape type='rectangle' id='lamp'><transform name='to_world'>\
+            <scale x='0'/></transform><emitter type='area'/></shape>"))
         .xml("point.xml", &format!("<shape type='sphere'>\n<float name='radius' value='0'/></shape>{LIT}"))
         .write("even.nrrd", "NRRD0004\ntype: uchar\ndimension: 3\nsizes: 2 2 2\nencoding: raw\n\n\0\0\0\0\0\0\0\0");
     bed.mistakes(&[
@@ -395,14 +452,30 @@ fn nothing_to_see_or_to_see_by() {
         ("render dark.xml", &["dark.xml", "emits light", "--light or --sky"]),
         ("render black.xml", &["black.xml", "emits light"]),
         ("render empty.xml", &["empty.xml", "no shapes"]),
-        ("render flat.xml", &["flat.xml"]),
-        ("render nan.xml", &["nan.xml:3"]),
-        ("render point.xml", &["point.xml:2", "radius 0"]),
-        ("render line-light.xml", &["line-light.xml:2", "\"lamp\" emits, but has no area", "--light or --sky"]),
+        ("render flat.xml", &["flat.xml: no primitive with finite vertices and an extent", "check its transforms"]),
+        (
+            "render flat-seen.xml",
+            &["flat-seen.xml:3:2: to_world flattens", "flat-seen.xml: the scene has no primitive", "12 have no area"],
+        ),
+        (
+            "check flat-seen.xml",
+            &["flat-seen.xml:3:2: to_world flattens", "flat-seen.xml: the scene has no primitive", "12 have no area"],
+        ),
+        ("check flat.obj", &["flat.obj: the scene has no primitive", "2 have no area", "1 problem in flat.obj"]),
+        ("check far.obj", &["far.obj: the scene has no primitive", "5 lie beyond", "scale is sane"]),
+        ("render nan.xml", &["nan.xml:3:28: \"nan\" is not finite"]),
+        ("render flat-sensor.xml", &["flat-sensor.xml:3:2: ", "to_world is singular", "leave out the scale of 0"]),
+        ("render point.xml", &["point.xml:2:1: ", "radius 0"]),
+        ("render line-light.xml", &["line-light.xml:2:21: ", "\"lamp\" emits, but has no area", "--light or --sky"]),
+        ("check line-light.xml", &["line-light.xml:2:21: ", "\"lamp\" emits, but has no area", "--light or --sky"]),
+        ("render nan-lamp.xml", &["nan-lamp.xml:3:3: ", "\"lamp\" emits, but has no area", "--light or --sky"]),
+        ("check nan-lamp.xml", &["nan-lamp.xml:3:3: ", "\"lamp\" emits, but has no area", "--light or --sky"]),
+        ("render no-lamp.xml", &["no-lamp.xml:3:3: ", "\"lamp\" emits, but has no area", "--light or --sky"]),
+        ("check no-lamp.xml", &["no-lamp.xml:3:3: ", "\"lamp\" emits, but has no area", "--light or --sky"]),
         ("render even.nrrd --iso 5", &["even.nrrd", "both sides of the iso value"]),
         ("render even.nrrd --iso nan", &["iso"]),
-        ("render film-0.xml", &["film-0.xml:2", "width 0 should lie between 1 and 65535"]),
-        ("render film-large.xml", &["film-large.xml:2", "width 100000 should lie between 1 and 65535"]),
+        ("render film-0.xml", &["film-0.xml:3:2: ", "width 0 should lie between 1 and 65535"]),
+        ("render film-large.xml", &["film-large.xml:3:2: ", "width 100000 should lie between 1 and 65535"]),
         ("render t.obj --size 0x0", &["0x0", "--size"]),
         ("render t.obj --size 100000x100000", &["100000x100000", "--size"]),
         ("render ior.xml", &["ior.xml:3:2: ", "int_ior over ext_ior is 0; it should lie between 0.1 and 10"]),
@@ -411,8 +484,18 @@ fn nothing_to_see_or_to_see_by() {
         ("check albedo.xml", &["albedo.xml:3:2: "]),
         ("render factor.xml", &["factor.xml:4:3: ", "specular_reflectance [1.0, 1.0, -1.0] should lie in [0, 1]"]),
         ("render rough.xml", &["rough.xml:2:48: roughness [-1.0, -1.0] should lie in (0, 1]"]),
-        ("render rough-nan.xml", &["rough-nan.xml:2", "\"nan\" is not finite"]),
+        ("render rough-nan.xml", &["rough-nan.xml:2:48: ", "\"nan\" is not finite"]),
     ]);
+
+    // beside other light it is dark, and that is told
+    for (name, place) in [("nan-lamp-lit", "3:3"), ("no-lamp-lit", "3:3"), ("flat-lamp-lit", "3:1")] {
+        let told =
+            format!("{name}.xml:{place}: shape \"lamp\" emits, but has no area that can be hit: it gives no light");
+        for line in [format!("render {name}.xml --spp 1 --size 8x8"), format!("check {name}.xml")] {
+            let run = bed.line(&line);
+            assert!(run.code == 0 && run.err.contains(&told), "{line}: {}", run.err);
+        }
+    }
 
     // without a camera a scene is framed; what is unusable is skipped, counted and reported
     bed.write("some.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nv nan 0 0\nv 2 0 0\nf 1 2 3\nf 1 2 4\nf 1 2 5\n");

@@ -165,8 +165,8 @@ fn bad_textures_are_named_together() {
     for part in [
         "s.xml:2:88: texture file \"gone.png\"",
         "s.xml:3:88: texture file \"text.jpg\"",
-        "s.xml:4",
-        "cut.hdr",
+        "s.xml:4:46: image ",
+        "cut.hdr: row 1: the file is cut off: get it again, or save it anew",
         "3 problems",
     ] {
         assert!(run.err.contains(part), "no {part:?} in {}", run.err);
@@ -175,5 +175,6 @@ fn bad_textures_are_named_together() {
     let run = rayherd(folder.path(), &["render", "s.xml"]);
     assert!(run.code == 2 && run.err.contains("gone.png") && run.err.contains("text.jpg"), "{}", run.err);
     let run = rayherd(folder.path(), &["render", "s.xml", "--substitute"]);
-    assert!(run.code == 2 && run.err.contains("cut.hdr") && run.err.contains("s.xml:4"), "{}", run.err);
+    assert!(run.code == 2 && run.err.contains("s.xml:4:46: image "), "{}", run.err);
+    assert!(run.err.contains("cut.hdr: row 1: the file is cut off: get it again, or save it anew"), "{}", run.err);
 }
