@@ -23,6 +23,7 @@ mod emitter;
 mod scene;
 mod sensor;
 mod shape;
+mod text;
 mod texture;
 mod transform;
 mod value;
@@ -244,8 +245,8 @@ impl<'a> Converter<'a> {
         self.entered += 1;
         if self.entered > MAX_OBJECTS || self.out.materials.len() > MAX_MATERIALS {
             let message = format!(
-                "more than {MAX_OBJECTS} objects or {MAX_MATERIALS} materials, each counted as often as it is referred to: let less \
-                 refer to what refers to others"
+                "more than {MAX_OBJECTS} objects or {MAX_MATERIALS} materials, each counted as often as it is referred to: put \
+                 fewer instances inside of instances, and fewer blends inside of blends"
             );
             return Err(ImportError::Limit { place: from.clone(), message });
         }

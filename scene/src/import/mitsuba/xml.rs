@@ -7,6 +7,7 @@ use std::collections::BTreeMap;
 use std::io::Read;
 use std::path::{Path, PathBuf};
 
+use super::text::{Lines, after_prolog, crowded_element, snake_case};
 use super::{transform, value};
 use crate::ImportError;
 use crate::description::{Affine, Place};
@@ -289,7 +290,7 @@ impl Reader {
             whole(format!("byte {} is not UTF-8; save the file as UTF-8", e.utf8_error().valid_up_to()))
         })?;
         let text = text.strip_prefix('\u{feff}').unwrap_or(&text);
-        if let Some(offset) = crowded_element(text) {
+        if let Some(offset) = crowded_element(text, MAX_ATTRIBUTES) {
             let place = Lines::of(text).place(path, offset.saturating_sub(1));
             return malformed(
                 &place,
@@ -494,22 +495,6 @@ impl Reader {
     }
 }
 
-/// Where the lines of a text begin: places by binary search, as roxmltree's own look-up is linear in the offset.
-struct Lines(Vec<usize>);
-
-impl Lines {
-    fn of(text: &str) -> Self {
-        let ends = text.bytes().enumerate().filter(|(_, b)| *b == b'\n').map(|(i, _)| i + 1);
-        Lines(std::iter::once(0).chain(ends).collect())
-    }
-    /// Of a byte. At most [`MAX_BYTES`] are read: both numbers fit.
-    fn place(&self, path: &Path, offset: usize) -> Place {
-        let line = self.0.partition_point(|&start| start <= offset);
-        let column = offset - self.0[line - 1] + 1;
-        Place { file: path.into(), line: line as u32, column: column as u32 }
-    }
-}
-
 fn file_name(path: &Path) -> String {
     path.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default()
 }
@@ -524,49 +509,4 @@ fn read_element<'a, 'input>(
         attributes.insert(attribute.name(), parameters.substitute(attribute.value(), place)?);
     }
     Ok(Element { node, place: place.clone(), attributes })
-}
-
-/// Offset of what follows the declaration, comments and instructions at the start.
-fn after_prolog(text: &str) -> usize {
-    let mut rest = text.trim_start();
-    while let Some(end) = [("<!--", "-->"), ("<?", "?>")].iter().find_map(|(start, end)| {
-        let at = rest.strip_prefix(start)?.find(end)?;
-        Some(start.len() + at + end.len())
-    }) {
-        rest = rest[end..].trim_start();
-    }
-    text.len() - rest.len()
-}
-
-/// Offset of a stretch without `<` that has too many `=`; an element's attributes lie in such a stretch.
-fn crowded_element(text: &str) -> Option<usize> {
-    let mut offset = 0;
-    for part in text.split('<') {
-        if part.bytes().filter(|b| *b == b'=').count() > MAX_ATTRIBUTES {
-            return Some(offset);
-        }
-        offset += part.len() + 1;
-    }
-    None
-}
-
-/// `toWorld` to `to_world`, as Mitsuba 3 upgrades older files.
-fn snake_case(name: &str) -> String {
-    let mut out = String::with_capacity(name.len() + 4);
-    let mut previous_lower = false;
-    let mut in_capitals = false;
-    for c in name.chars() {
-        if c.is_ascii_uppercase() && (previous_lower || in_capitals) {
-            if previous_lower {
-                out.push('_');
-            }
-            out.push(c.to_ascii_lowercase());
-            in_capitals = true;
-        } else {
-            out.push(c);
-            in_capitals = false;
-        }
-        previous_lower = c.is_ascii_lowercase();
-    }
-    out
 }
