@@ -383,30 +383,37 @@ fn refraction_is_the_definition() {
     }
 }
 
-/// f(wo, wi) = f(wi, wo); across an interface f(wo, wi) over the square of the index at `wo` (radiance shrinks as it enters).
+/// f(wo, wi) = f(wi, wo); across an interface f(wo, wi) over the square of the index at `wo` (radiance shrinks as it enters). How many of some random
+/// pairs on one side, and across, scatter anything.
+pub(super) fn exchanged(bsdf: &Bsdf, front: bool, pairs: u32, rng: &mut Rng) -> [u32; 2] {
+    let mut seen = [0; 2];
+    for _ in 0..pairs {
+        let mut up = || {
+            let d = rng.direction();
+            Vec3::new(d.x, d.y, d.z.abs().max(1e-3)).normalize()
+        };
+        let (a, b) = (up(), up());
+        let (ab, ba) = (bsdf.eval(a, b, front).value / b.z, bsdf.eval(b, a, front).value / a.z);
+        let close = (ab - ba).abs().cmple(1e-3 * ab.max(ba) + 1e-12).all();
+        assert!(close, "{bsdf:?} {front} {a} {b}: {ab} {ba}");
+        seen[0] += u32::from(ab.max_element() > 0.0);
+        if let Bsdf::RoughDielectric { eta, .. } = *bsdf {
+            let flip = |v: Vec3| Vec3::new(v.x, v.y, -v.z);
+            let there = bsdf.eval(a, flip(b), front).value / b.z * relative(eta, front).powi(2);
+            let back = bsdf.eval(b, flip(a), !front).value / a.z;
+            // near the critical angle cosines, and with them small values, are mostly rounding
+            let close = (there - back).abs().cmple(1e-2 * there.max(back) + 1e-4).all();
+            assert!(close, "{bsdf:?} {front} {a} {b}: {there} {back}");
+            seen[1] += u32::from(there.max_element() > 0.0);
+        }
+    }
+    seen
+}
+
 #[test]
 fn directions_may_be_exchanged() {
     let mut rng = Rng(3);
-    let mut crossed = 0;
-    for (bsdf, front) in all() {
-        for _ in 0..2000 {
-            let mut up = || {
-                let d = rng.direction();
-                Vec3::new(d.x, d.y, d.z.abs().max(1e-3)).normalize()
-            };
-            let (a, b) = (up(), up());
-            let (ab, ba) = (bsdf.eval(a, b, front).value.x / b.z, bsdf.eval(b, a, front).value.x / a.z);
-            assert!((ab - ba).abs() <= 1e-3 * ab.max(ba) + 1e-12, "{bsdf:?} {a} {b}: {ab} {ba}");
-            if let Bsdf::RoughDielectric { eta, .. } = bsdf {
-                let flip = |v: Vec3| Vec3::new(v.x, v.y, -v.z);
-                let there = bsdf.eval(a, flip(b), front).value.x / b.z * relative(eta, front).powi(2);
-                let back = bsdf.eval(b, flip(a), !front).value.x / a.z;
-                // near the critical angle cosines, and with them small values, are mostly rounding
-                assert!((there - back).abs() <= 1e-2 * there.max(back) + 1e-4, "{bsdf:?} {a} {b}: {there} {back}");
-                crossed += u32::from(there > 0.0);
-            }
-        }
-    }
+    let crossed: u32 = all().iter().map(|(bsdf, front)| exchanged(bsdf, *front, 2000, &mut rng)[1]).sum();
     assert!(crossed > 10_000, "{crossed}");
 }
 
