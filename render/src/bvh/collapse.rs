@@ -16,6 +16,11 @@ const PRIMITIVE_COST: f32 = 0.1;
 /// Below this many boxes a subtree is done by one thread.
 const FORK_ABOVE: u32 = 1 << 14;
 
+/// Expected cost of a leaf of so many boxes, for its box's half area.
+pub(super) fn leaf_cost(area: f32, boxes: u32) -> f32 {
+    area * (LEAF_COST + PRIMITIVE_COST * boxes as f32)
+}
+
 /// What the boxes of a tree stand for.
 pub(super) trait Content: Sync {
     /// How many boxes may share a leaf.
@@ -243,7 +248,7 @@ impl Chooser<'_> {
     fn costs(&self, node: usize, choice: &mut Choice, below: &mut [Choice]) -> [f32; WIDTH] {
         let n = &self.nodes[node];
         if n.count == 1 {
-            return [n.aabb.half_area() * (LEAF_COST + PRIMITIVE_COST); WIDTH];
+            return [leaf_cost(n.aabb.half_area(), 1); WIDTH];
         }
         let first = n.child as usize;
         let (children, rest) = below.split_at_mut(2);
@@ -276,8 +281,7 @@ fn choose(node: &BinaryNode, max_leaf: u32, a: &[f32; WIDTH], b: &[f32; WIDTH], 
     }
     let area = node.aabb.half_area();
     let inner = area * NODE_COST + cost[WIDTH - 1];
-    let leaf =
-        if node.count <= max_leaf { area * (LEAF_COST + PRIMITIVE_COST * node.count as f32) } else { f32::INFINITY };
+    let leaf = if node.count <= max_leaf { leaf_cost(area, node.count) } else { f32::INFINITY };
     choice[0] = u8::from(inner < leaf);
     cost[0] = inner.min(leaf);
     for j in 1..WIDTH {

@@ -16,6 +16,7 @@ mod layout;
 mod order;
 mod parts;
 mod regions;
+mod reinsert;
 mod sah;
 mod top;
 pub mod trace;

@@ -10,6 +10,7 @@ use std::collections::BinaryHeap;
 use super::check::Tree;
 use super::collapse::{Content, Plan};
 use super::layout::*;
+use super::reinsert::improved;
 use super::{Serial, boxes};
 
 /// Entries that a block is opened into, at most: slabs that overlap along a whole axis then cost some per cent.
@@ -79,7 +80,7 @@ impl Top {
     /// tree; `None` when `place` has no room.
     pub fn build<'a>(&self, place: impl FnOnce(usize) -> Option<(&'a mut [u8], usize)>) -> Option<Tree> {
         let boxes: Vec<Aabb> = self.entries.iter().map(|e| e.aabb).collect();
-        let binary = boxes::build(&boxes);
+        let binary = improved(boxes::build(&boxes), 1);
         let plan = Plan::new(&binary, self, &Serial);
         let (out, at) = place(plan.bytes)?;
         let aabb = plan.write(out, at);

@@ -84,7 +84,7 @@ fn each_kind_of_damage_is_named() {
     let far = |o: &mut Vec<u8>| (0..3).for_each(|vertex| write_f32(o, at + 3 * vertex * n * 4, read_f32(&good, 52)));
     says(with(&far), "a box does not meet its triangles");
     let other = read_u32(&good, index);
-    let free = (0..150).find(|&i| i < other && i != other).unwrap();
+    let free = (0..read_u32(&good, index + 4)).find(|&i| i != other).unwrap();
     says(with(&|o| write_u32(o, index, free)), "primitives are missing");
 }
 
