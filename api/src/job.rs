@@ -285,7 +285,7 @@ fn default_up() -> [f64; 3] {
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "camelCase", deny_unknown_fields)]
 pub struct SamplingSpec {
-    /// Samples per pixel; with a target error or a time limit, the most that are taken.
+    /// Samples per pixel; with a target error or a time limit, the most that are taken: with a target error on average, as tiles that need fewer get fewer.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[schemars(range(min = 1, max = 16_777_216))]
     pub spp: Option<i32>,

@@ -33,9 +33,10 @@ ROWS = [
     ("shadows", CORNELL, ["rays.shadow"]),
     ("merged", CORNELL + ["--split", "4"], ["rays.closest"]),
     ("roulette", CORNELL, ["rays.closest", "rays.shadow", "rel_mse"]),
+    ("tiles", ["VEACH-MIS", "--size", "256x256", "--spp", "4096", "--target-error", "0.0005"], ["samples", "cpu_s", "rel_mse"]),
     ("lights", ["LAMPS", "--size", "128x128", "--spp", "16"], ["rays.shadow", "rel_mse"]),
 ]
-SAME_MEAN = {"roulette", "lights"}
+SAME_MEAN = {"roulette", "lights", "tiles"}
 
 
 def value(report, key):
@@ -64,6 +65,7 @@ def main():
             "CHEST": arguments.data / "ct-lidc-0314" / "dicom",
             "CORNELL": arguments.examples / "cornell-box.xml",
             "STAIRCASE": next((arguments.data / "scene-staircase").glob("**/*.xml")),
+            "VEACH-MIS": next((arguments.data / "scene-veach-mis").glob("**/*.xml")),
             "LAMPS": work / "lamps.xml",
             "STORE": work / "store",
         }

@@ -9,6 +9,7 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use serde::{Deserialize, Serialize};
 
+use crate::allot::Step;
 use crate::report::RayCounts;
 use crate::wave::{CameraUnit, Done};
 
@@ -111,6 +112,9 @@ pub struct Snapshot {
     pub waiting: Vec<GroupRef>,
     /// Samples whose camera rays were made.
     pub done: Done,
+    /// The last step that was planned by what tiles needed; none while all get the same.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub step: Option<Step>,
     /// Commits so far.
     pub commits: u64,
     /// Rays traced so far.
@@ -165,6 +169,7 @@ pub struct Ledger {
     // camera units of running tasks are in `taken`, not in `done`
     done: Done,
     taken: Done,
+    step: Option<Step>,
     running: BTreeMap<TaskId, Running>,
     next_task: u64,
     commits: u64,
@@ -183,6 +188,7 @@ impl Ledger {
             waiting: BTreeMap::new(),
             done: Done::none(tiles),
             taken: Done::none(tiles),
+            step: None,
             running: BTreeMap::new(),
             next_task: 0,
             commits: 0,
@@ -208,6 +214,14 @@ impl Ledger {
     pub fn done(&self) -> &Done {
         &self.done
     }
+    /// The last step that was planned by what tiles needed.
+    pub fn step(&self) -> Option<&Step> {
+        self.step.as_ref()
+    }
+    /// Such a step was planned. It counts from the next snapshot on.
+    pub fn plan_step(&mut self, step: Step) {
+        self.step = Some(step);
+    }
     /// Tasks that run.
     pub fn running(&self) -> usize {
         self.running.len()
@@ -228,7 +242,7 @@ impl Ledger {
     pub fn attempts_lost(&self) -> u64 {
         self.attempts_lost
     }
-    /// Whether a snapshot is of the state as it is now, wherever its objects lie.
+    /// Whether a snapshot is of the state as it is now, wherever its objects lie, and whatever step is planned.
     pub fn is_as(&self, s: &Snapshot) -> bool {
         let waiting =
             s.waiting.len() == self.waiting.len() && s.waiting.iter().all(|g| self.waiting.contains_key(&g.key));
@@ -317,7 +331,7 @@ impl Ledger {
         let mut waiting: Vec<GroupRef> = self.waiting.values().chain(held).cloned().collect();
         waiting.sort_by(|a, b| a.key.cmp(&b.key));
         let (commits, rays, non_finite) = (self.commits, self.rays, self.non_finite);
-        Snapshot { film, waiting, done: self.done.clone(), commits, rays, non_finite }
+        Snapshot { film, waiting, done: self.done.clone(), step: self.step.clone(), commits, rays, non_finite }
     }
 
     /// Gives up all running tasks and takes the state of a snapshot, whose record is durable.
@@ -382,6 +396,7 @@ impl Ledger {
             self.waiting = s.waiting.iter().map(|g| (g.key.clone(), g.clone())).collect();
             self.done = s.done.clone();
             self.taken = s.done.clone();
+            self.step.clone_from(&s.step);
             (self.commits, self.rays, self.non_finite) = (s.commits, s.rays, s.non_finite);
             (self.head, self.sequence) = (name, record.sequence + 1);
             return Ok(());

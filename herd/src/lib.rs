@@ -1,5 +1,6 @@
 //! Rays in motion: stores, wire formats, planning, rounds, the local run.
 
+pub mod allot;
 pub mod driver;
 pub mod flight;
 pub mod job;

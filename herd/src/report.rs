@@ -174,9 +174,12 @@ pub struct Report {
     pub wall_s: f64,
     /// CPU-seconds of this process.
     pub cpu_s: f64,
-    /// Samples per pixel that the image holds.
+    /// Samples per pixel that the image holds: the fewest of a film tile, where they differ.
     pub spp: u32,
-    /// Camera samples that the image holds: pixels x samples per pixel.
+    /// The most of a film tile.
+    #[serde(default)]
+    pub most_spp: u32,
+    /// Camera samples that the image holds: the sum over its pixels.
     pub samples: u64,
     /// Rays traced by committed tasks, those of earlier runs that this one took over included.
     pub rays: RayCounts,

@@ -6,6 +6,7 @@
 
 use std::ops::Range;
 
+use rayherd_render::film::Samples;
 use serde::{Deserialize, Serialize};
 
 /// Most samples per pixel: the sampler repeats after them, and the film's sums are sized for them.
@@ -42,6 +43,11 @@ pub fn step_end(samples: u32) -> u32 {
         wave *= 4;
     }
     if samples < 1 { 1 } else { (samples / wave + 1) * wave }
+}
+
+/// Whether a step ends there.
+pub fn is_step_end(samples: u32) -> bool {
+    samples > 0 && step_end(samples - 1) == samples
 }
 
 /// Which samples of each tile are done: disjoint ranges by tile, adjacent ones joined.
@@ -118,7 +124,15 @@ impl Done {
     }
     /// Samples that every tile has, counted from 0.
     pub fn complete(&self) -> u32 {
-        self.0.iter().map(|r| r.first().map_or(0, |&(a, b)| if a == 0 { b } else { 0 })).min().unwrap_or(0)
+        self.begin().least()
+    }
+    /// Samples that each tile has, counted from 0.
+    pub fn begin(&self) -> Samples {
+        Samples::of(self.0.iter().map(|r| r.first().map_or(0, |&(a, b)| if a == 0 { b } else { 0 })).collect())
+    }
+    /// One past the last sample of each tile.
+    pub fn ends(&self) -> Samples {
+        Samples::of(self.0.iter().map(|r| r.last().map_or(0, |r| r.1)).collect())
     }
     /// One past the last sample of any tile.
     pub fn reach(&self) -> u32 {
@@ -129,6 +143,7 @@ impl Done {
 #[cfg(test)]
 mod tests {
     use proptest::prelude::*;
+    use rayherd_render::film::PerTile;
 
     use super::*;
 
@@ -168,6 +183,11 @@ mod tests {
             }
             let complete = (0..3).map(|t| naive[t].iter().take_while(|c| **c).count()).min().unwrap();
             prop_assert_eq!(done.complete() as usize, complete);
+            for tile in 0..3 {
+                let (begin, end) = (done.begin().of_tile(tile) as usize, done.ends().of_tile(tile) as usize);
+                prop_assert_eq!(begin, naive[tile].iter().take_while(|c| **c).count());
+                prop_assert_eq!(end, naive[tile].iter().rposition(|c| *c).map_or(0, |last| last + 1));
+            }
             while let Some(unit) = added.pop() {
                 done.remove(unit);
             }

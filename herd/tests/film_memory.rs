@@ -85,7 +85,7 @@ fn child() {
     let read = |part: &FilmRef| Ok(fs::read(folder.join(&part.key)).unwrap());
     let adder = Adder { layout, band: size, read: &read };
     let out = BufWriter::new(File::create(folder.join("picture.exr")).unwrap());
-    let totals = adder.picture(&parts, 2, [0.0; 3], &definition(), out, |_| Ok(())).unwrap();
+    let totals = adder.picture(&parts, &2.into(), [0.0; 3], &definition(), out, |_| Ok(())).unwrap();
     assert!(totals.error.is_some_and(|e| e.mean(SIZE) > 0.0));
     println!("peak {}", peak_memory().map_or(0, |kib| kib << 10));
 }

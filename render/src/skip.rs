@@ -1,8 +1,8 @@
 //! What is not done because a scene does not need it: named switches, and how often each was made.
 //!
-//! A skip is made unless it is switched off, which is for whoever wants to see what it saves, or doubts it. All but [`Skip::Roulette`] and
-//! [`Skip::Lights`] leave every byte of the image as it is; these two choose by probability and leave its mean. `docs/skips.md` says what
-//! each saves.
+//! A skip is made unless it is switched off, which is for whoever wants to see what it saves, or doubts it. All but [`Skip::Roulette`],
+//! [`Skip::Lights`] and [`Skip::Tiles`] leave every byte of the image as it is; the first two choose by probability and leave its mean, the third
+//! chooses where a picture with a target error gets its samples. `docs/skips.md` says what each saves.
 
 use std::collections::BTreeMap;
 use std::ops::AddAssign;
@@ -46,6 +46,9 @@ pub enum Skip {
     Aovs,
     /// Film tiles that no light reached are neither held nor stored. Counted: tiles, once for each task.
     Film,
+    /// A picture with a target error gets fewer samples in film tiles that need them less. Counted: camera samples that all tiles would have had
+    /// more, if each had as many as the one with most.
+    Tiles,
     /// What is prepared is not prepared again. Counted: objects.
     Prepared,
     /// Cells of a volume that its surface does not cross are not looked into. Counted: cells, once for each pass.
@@ -64,7 +67,7 @@ fn names() -> String {
 
 impl Skip {
     /// All of them.
-    pub const ALL: [Skip; 17] = [
+    pub const ALL: [Skip; 18] = [
         Skip::Cells,
         Skip::Beaten,
         Skip::Walk,
@@ -80,6 +83,7 @@ impl Skip {
         Skip::Roulette,
         Skip::Aovs,
         Skip::Film,
+        Skip::Tiles,
         Skip::Prepared,
         Skip::Volume,
     ];
@@ -102,14 +106,15 @@ impl Skip {
             Skip::Roulette => "roulette",
             Skip::Aovs => "aovs",
             Skip::Film => "film",
+            Skip::Tiles => "tiles",
             Skip::Prepared => "prepared",
             Skip::Volume => "volume",
         }
     }
 
-    /// Whether the image is the same bytes with and without it; else it is the same in the mean.
+    /// Whether the image is the same bytes with and without it; else it is the same in the mean, or has as little error.
     pub const fn keeps_bytes(self) -> bool {
-        !matches!(self, Skip::Lights | Skip::Roulette)
+        !matches!(self, Skip::Lights | Skip::Roulette | Skip::Tiles)
     }
 }
 

@@ -10,9 +10,6 @@ use rayherd_herd::local::{JobOutcome, render_local};
 use rayherd_render::frame::Frame;
 use rayherd_scene::prepare::PrepareSettings;
 
-const SIZE: u32 = 12;
-/// Most samples, and those of the pictures to compare with.
-const MOST: u32 = 64;
 /// The mean may be off by this share of itself, beside the noise of the measurement.
 const BIAS: f64 = 1e-2;
 /// The error that is left may be so many times the target: few samples tell little of rare bright ones.
@@ -25,9 +22,9 @@ fn seeds() -> u64 {
     }
 }
 
-fn render(scene: &PreparedScene, frame: &Frame, seed: u64, target: Option<f64>) -> JobOutcome {
+fn render(scene: &PreparedScene, frame: &Frame, seed: u64, spp: u32, target: Option<f64>) -> JobOutcome {
     let frame = Frame { seed, ..frame.clone() };
-    let sampling = Sampling { spp: MOST, target_error: target, time_limit: None };
+    let sampling = Sampling { spp, target_error: target, time_limit: None };
     render_local(scene, &frame, &sampling, &JobSettings::default(), &Silent).unwrap()
 }
 
@@ -51,23 +48,34 @@ fn rel_mse(picture: &[f64], truth: &[f64]) -> f64 {
 
 #[test]
 fn what_stopping_at_a_target_leaves() {
-    let (scene, frame) = example::prepared("cornell-box.xml", SIZE, 6, &PrepareSettings::default());
+    measure(12, 64, &[0.06, 0.015]);
+}
+
+/// The same where samples are shared out among tiles by what they were found to need: four of them, of 1,024 to 4 pixels.
+#[test]
+fn what_sharing_samples_out_leaves() {
+    measure(34, 192, &[0.004]);
+}
+
+/// Of a picture of `size` by `size` pixels against `most` samples a pixel, which are more than any target takes.
+fn measure(size: u32, most: u32, targets: &[f64]) {
+    let (scene, frame) = example::prepared("cornell-box.xml", size, 6, &PrepareSettings::default());
     let seeds = seeds();
-    let fixed: Vec<Vec<f64>> = (0..seeds).map(|seed| pixels(&render(&scene, &frame, seed, None))).collect();
+    let fixed: Vec<Vec<f64>> = (0..seeds).map(|seed| pixels(&render(&scene, &frame, seed, most, None))).collect();
     let mut truth = vec![0.0; fixed[0].len()];
     fixed.iter().for_each(|picture| truth.iter_mut().zip(picture).for_each(|(t, p)| *t += p / seeds as f64));
     let level = truth.iter().sum::<f64>() / truth.len() as f64;
-    for target in [0.06, 0.015] {
+    for &target in targets {
         let (mut off, mut squares, mut samples, mut told, mut real) = (vec![], vec![], vec![], vec![], vec![]);
         for (seed, fixed) in (0..seeds).zip(&fixed) {
-            let made = render(&scene, &frame, seed, Some(target));
+            let made = render(&scene, &frame, seed, most, Some(target));
             assert_eq!(made.report.target_reached, Some(true), "seed {seed}");
             let picture = pixels(&made);
             // the same samples begin both, so most of the noise is the same
             let differences: Vec<f64> = picture.iter().zip(fixed).map(|(p, f)| (p - f) / level).collect();
             off.push(differences.iter().sum::<f64>() / differences.len() as f64);
             squares.push(differences);
-            samples.push(f64::from(made.spp));
+            samples.push(made.report.samples as f64 / f64::from(size * size));
             told.push(made.report.rel_mse.unwrap());
             real.push(rel_mse(&picture, &truth));
         }
@@ -84,7 +92,7 @@ fn what_stopping_at_a_target_leaves() {
             truth.len()
         );
         assert!(samples.iter().any(|&n| n != samples[0]), "all seeds stop at {spp} samples: nothing is chosen");
-        assert!(samples.iter().all(|&n| (2.0..f64::from(MOST)).contains(&n)), "{samples:?}");
+        assert!(samples.iter().all(|&n| (2.0..f64::from(most)).contains(&n)), "{samples:?}");
         assert!(off.abs() < BIAS + 4.0 * error, "target {target}: off by {off} +- {error}");
         // what is told at the end was chosen for being low
         assert!(real < LEFT * target + 4.0 * real_error, "target {target}: relMSE is {real} +- {real_error}");

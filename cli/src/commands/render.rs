@@ -116,10 +116,10 @@ struct KeepOptions {
 #[derive(Args)]
 #[command(next_help_heading = "Sampling")]
 struct SamplingOptions {
-    /// Samples per pixel; with a target error or time limit, the most [default: the scene's, or 64]
+    /// Samples per pixel; with a target error (then on average) or time limit, the most [default: the scene's, or 64]
     #[arg(long, value_name = "N", allow_hyphen_values = true)]
     spp: Option<i32>,
-    /// Stop when the estimated relative squared error (relMSE) is at most this, such as 0.01
+    /// Stop when the estimated relative squared error (relMSE) is at most this, such as 0.01; parts of the picture that need fewer samples get fewer
     #[arg(long, value_name = "E", allow_hyphen_values = true)]
     target_error: Option<f64>,
     /// Start no further step of samples after so many seconds
@@ -313,12 +313,12 @@ fn save(scene: &PreparedScene, shot: &Shot, outcome: &JobOutcome, image: &ImageS
     if !image.writes(PictureFile::Exr) {
         return Ok(());
     }
-    let mut definition = spec::definition(&scene.manifest, &shot.frame, outcome.spp)?;
+    let mut definition = spec::definition(&scene.manifest, &shot.frame, &outcome.samples)?;
     if !scene.skips().makes(Skip::Lights) {
         // the frame says nothing of it
         definition.insert("no_skip".to_owned(), json!([Skip::Lights.name()]));
     }
-    let channels = outcome.film.channels(outcome.spp, scene.manifest.offset);
+    let channels = outcome.film.channels(&outcome.samples, scene.manifest.offset);
     replace::replace_or_keep(&shot.exr, &picture::encode(&outcome.image, &channels, &definition)?)
 }
 
@@ -365,10 +365,12 @@ fn tell(files: &[PathBuf], frame: &Frame, report: &Report, sampling: &Sampling) 
         _ => String::new(),
     };
     let rays = report.rays.closest + report.rays.shadow;
+    let (least, most) = (report.spp, report.most_spp);
+    let mean = report.samples as f64 / (f64::from(width) * f64::from(height));
+    let spp = if least == most { format!("{most} spp") } else { format!("{mean:.0} spp ({least} to {most})") };
     print(&format!(
-        "{}: {width}x{height}, {} spp, {error}{target}, {} rays, {:.2} CPU-seconds\n",
+        "{}: {width}x{height}, {spp}, {error}{target}, {} rays, {:.2} CPU-seconds\n",
         files.join(" and "),
-        report.spp,
         si(rays as f64),
         report.cpu_s
     ))

@@ -1,8 +1,8 @@
 //! Camera units that were not handed out yet, by the split where they start.
 
 use std::collections::{BTreeMap, VecDeque};
-use std::ops::Range;
 
+use rayherd_render::film::{PerTile, Samples};
 use rayherd_render::frame::Frame;
 
 use crate::task::camera::tile_pixels;
@@ -33,17 +33,24 @@ impl Cameras {
     pub fn clear(&mut self) {
         self.queues.clear();
     }
-    /// Adds what of the samples was not taken.
-    pub fn add(&mut self, samples: Range<u32>, taken: &Done) {
-        let len = UNIT_SAMPLES.max((samples.end - samples.start).div_ceil(STEP_PARTS));
-        for first in samples.clone().step_by(len as usize) {
-            let part = first..first.saturating_add(len).min(samples.end);
-            for tile in 0..self.starts.len() as u32 {
-                for unit in taken.missing(tile, &part) {
+    /// Adds what of the samples between two states was not taken.
+    pub fn add(&mut self, from: &Samples, to: &Samples, taken: &Done) {
+        let ends = |tile: usize| (from.of_tile(tile), to.of_tile(tile));
+        let most = (0..self.starts.len()).map(|t| ends(t).1.saturating_sub(ends(t).0)).max().unwrap_or(0);
+        let len = UNIT_SAMPLES.max(most.div_ceil(STEP_PARTS));
+        for begin in (0..most).step_by(len as usize) {
+            for tile in 0..self.starts.len() {
+                let (first, end) = ends(tile);
+                let first = first.saturating_add(begin);
+                for unit in taken.missing(tile as u32, &(first..first.saturating_add(len).min(end))) {
                     self.push_back(unit);
                 }
             }
         }
+    }
+    /// Pixels of each tile.
+    pub fn pixels(&self) -> &[u64] {
+        &self.pixels
     }
     /// Puts units of a task that was given up first in their queues.
     pub fn give_back(&mut self, units: &[CameraUnit]) {

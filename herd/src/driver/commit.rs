@@ -99,14 +99,14 @@ impl<F: FilmSum> Driver<'_, '_, F> {
             self.write_snapshot()?;
         }
         if self.progress.wants_preview()
-            && let Some(image) = self.film.preview(self.ledger.taken().reach().max(1))
+            && let Some(image) = self.film.preview(&self.ledger.taken().ends())
         {
             self.progress.preview(&image);
         }
         // for the display: about, since some pixels may wait for samples that others have. What decides is in `step_done`
         if self.progress.wants_error() && Instant::now() >= self.next_error {
             let begun = Instant::now();
-            self.error = self.film.shown_error(self.ledger.taken().reach()).or(self.error);
+            self.error = self.film.shown_error(&self.ledger.taken().ends()).or(self.error);
             self.next_error = Instant::now() + ERROR_EVERY.max(ERROR_SHARE * begun.elapsed());
         }
         Ok(())

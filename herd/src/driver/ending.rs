@@ -2,9 +2,11 @@
 
 use std::collections::BTreeMap;
 
+use rayherd_render::film::Samples;
 use rayherd_render::skip::Skip;
 
 use super::{Driver, FilmSum};
+use crate::allot;
 use crate::job::{JobError, Status};
 use crate::local::usage;
 use crate::report::Report;
@@ -30,18 +32,20 @@ impl<F: FilmSum> Driver<'_, '_, F> {
     ///
     /// # Errors
     /// When the film's error cannot be had.
-    pub fn finish(mut self) -> Result<(F, u32, Report), JobError> {
+    pub fn finish(mut self) -> Result<(F, Samples, Report), JobError> {
         // the picture is whole, and all that it is made of is committed: a store that fails now may not cost it
         if self.is_durable()
             && let Err(e) = self.write_snapshot()
         {
             tracing::warn!("the store stays as the last commit left it: {e}");
         }
-        let spp = self.ledger.done().complete();
-        let [width, height] = self.shared.frame.size;
+        let samples = self.ledger.done().begin();
+        let pixels = self.cameras.pixels();
+        let made = allot::total(&samples, pixels);
+        self.skipped.add(Skip::Tiles, allot::total(&samples.most().into(), pixels) - made);
         let settings = self.shared.settings;
         let counts = &self.shared.scene.manifest.counts;
-        let rel_mse = self.film.rel_mse(spp)?;
+        let rel_mse = self.film.rel_mse(&samples)?;
         let (bytes, nodes_detail) = self.shared.nodes.report();
         let skipped = [
             ("degenerate", counts.degenerate),
@@ -59,8 +63,9 @@ impl<F: FilmSum> Driver<'_, '_, F> {
             attempts_lost: self.ledger.attempts_lost(),
             wall_s: self.start.elapsed().as_secs_f64(),
             cpu_s: usage::process_cpu(),
-            spp,
-            samples: u64::from(width) * u64::from(height) * u64::from(spp),
+            spp: samples.least(),
+            most_spp: samples.most(),
+            samples: made,
             rays: self.ledger.rays(),
             scene_bytes: self.shared.scene.manifest.scene_bytes(),
             hops: self.hops,
@@ -76,7 +81,7 @@ impl<F: FilmSum> Driver<'_, '_, F> {
         report.set_bytes(&bytes);
         report.skips = self.skips();
         report.profile = self.profile;
-        Ok((self.film, spp, report))
+        Ok((self.film, samples, report))
     }
 
     /// What committed tasks of this run left out; what is not known here is missing.

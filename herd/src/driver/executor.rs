@@ -2,6 +2,8 @@
 
 use std::time::Duration;
 
+use rayherd_render::film::{ErrorSum, Samples};
+
 use crate::job::{Image, JobError};
 use crate::ledger::{FilmRef, TaskId};
 use crate::local::attempt::{Attempt, Made};
@@ -111,7 +113,12 @@ pub trait FilmSum {
     ///
     /// # Errors
     /// When the sum cannot be had.
-    fn rel_mse(&mut self, spp: u32) -> Result<Option<f64>, JobError>;
+    fn rel_mse(&mut self, samples: &Samples) -> Result<Option<f64>, JobError>;
+    /// What it is the mean of, by tile.
+    ///
+    /// # Errors
+    /// When the sum cannot be had.
+    fn tile_errors(&mut self, samples: &Samples) -> Result<Option<Vec<ErrorSum>>, JobError>;
     /// Stored objects that lie on a store.
     fn on_store(&self, _store: u32) -> Objects {
         Vec::new()
@@ -121,11 +128,11 @@ pub trait FilmSum {
     /// Whether a stored object is still needed.
     fn needs(&self, name: &str) -> bool;
     /// The error of the sum as it is, about, for whoever watches: only where it costs little.
-    fn shown_error(&self, _spp: u32) -> Option<f64> {
+    fn shown_error(&self, _samples: &Samples) -> Option<f64> {
         None
     }
     /// The picture of the sum as it is, likewise.
-    fn preview(&self, _spp: u32) -> Option<Image> {
+    fn preview(&self, _samples: &Samples) -> Option<Image> {
         None
     }
 }

@@ -2,7 +2,7 @@
 
 use super::{Driver, Executor, FilmSum, Objects};
 use crate::job::JobError;
-use crate::ledger::Outputs;
+use crate::ledger::{Outputs, Snapshot};
 use crate::report::Kind;
 
 impl<F: FilmSum> Driver<'_, '_, F> {
@@ -16,7 +16,8 @@ impl<F: FilmSum> Driver<'_, '_, F> {
         tracing::warn!("{why}; what was committed since no ray was on its way is computed again");
         let before: Objects =
             self.ledger.snapshot(Vec::new()).waiting.into_iter().map(|g| (g.key, g.holders)).collect();
-        let mut snapshot = self.settled.clone();
+        // what a step stands on is made again as it was
+        let mut snapshot = Snapshot { step: self.ledger.step().cloned(), ..self.settled.clone() };
         self.film.go_back();
         self.redone += self.ledger.commits() - snapshot.commits;
         if self.is_durable() {
@@ -31,7 +32,7 @@ impl<F: FilmSum> Driver<'_, '_, F> {
         self.stop_all();
         self.running.clear();
         self.cameras.clear();
-        self.cameras.add(0..self.queued, self.ledger.taken());
+        self.cameras.add(&0.into(), &self.queued, self.ledger.taken());
         self.shared.nodes.delete(&before)
     }
 

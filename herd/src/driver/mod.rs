@@ -16,6 +16,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
+use rayherd_render::film::{ErrorSum, Samples};
 use rayherd_render::skip::SkipCounts;
 
 use crate::job::{JobError, Progress, Sampling};
@@ -70,7 +71,9 @@ pub struct Driver<'s, 'a, F> {
     sampling: &'s Sampling,
     progress: &'s dyn Progress,
     /// Samples whose units were queued.
-    queued: u32,
+    queued: Samples,
+    /// The errors of tiles when these were made, where that was asked for.
+    learned: Option<Vec<ErrorSum>>,
     /// Splits that rays can need along the curve through space, and their places in it.
     order: Vec<u32>,
     rank: Vec<u32>,
@@ -125,10 +128,13 @@ impl<'s, 'a, F: FilmSum> Driver<'s, 'a, F> {
         let order = scene.owning_order();
         let mut rank = vec![0; scene.splits() as usize];
         order.iter().enumerate().for_each(|(r, &s)| rank[s as usize] = r as u32);
-        let starts = scene.start_splits(shared.frame).into_iter().map(|s| rank[s as usize]).collect();
+        let starts: Vec<u32> = scene.start_splits(shared.frame).into_iter().map(|s| rank[s as usize]).collect();
+        let made = begin.ledger.done().begin();
+        let planned = begin.ledger.step().and_then(|step| Some(step.after(step.parts(&made, starts.len())?)));
         Driver {
             shared,
-            queued: begin.ledger.done().complete(),
+            queued: planned.unwrap_or(Samples::Even(made.least())),
+            learned: None,
             settled: begin.settled,
             taken_over: begin.ledger.rays(),
             session: begin.session,
@@ -179,13 +185,13 @@ impl<'s, 'a, F: FilmSum> Driver<'s, 'a, F> {
         let barrier = self.shared.settings.has_barrier();
         self.memory = executor.memory().unwrap_or(u64::MAX);
         loop {
-            if self.queued > 0 && self.is_step_over() && self.step_done()? {
+            if self.queued.most() > 0 && self.is_step_over() && self.step_done()? {
                 return Ok(());
             }
             if self.progress.is_cancelled() {
                 return Err(JobError::Cancelled);
             }
-            self.queue_steps();
+            self.queue_steps()?;
             let mut started = false;
             // asked before planning: one that comes up meanwhile was not planned for
             let all_up = (0..self.free.len() as u32).all(|n| executor.is_up(n));

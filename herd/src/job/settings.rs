@@ -110,9 +110,9 @@ impl JobSettings {
 /// Which samples are taken, and when to stop.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Sampling {
-    /// Most samples per pixel, at most 2^24.
+    /// Most samples per pixel, at most 2^24: on average, where they are shared out for a target error ([`crate::allot`]).
     pub spp: u32,
-    /// Stop at the first step (see [`crate::wave`]) where the estimated relMSE is at most this.
+    /// Stop at the first part of a step (see [`crate::wave`]) where the estimated relMSE is at most this.
     pub target_error: Option<f64>,
     /// Start no step of the schedule after so many seconds.
     pub time_limit: Option<f64>,

@@ -4,6 +4,7 @@
 use rayherd_api::{self as api, CameraSpec, LightSpec, RenderJobSpec, StorageSpec, Strategy};
 use rayherd_render::aov::{Aov, Aovs};
 use rayherd_render::camera::{Camera, View};
+use rayherd_render::film::Samples;
 use rayherd_render::filter::Filter;
 use rayherd_render::frame::Frame;
 use rayherd_scene::import::{CameraView, ImportOptions, Light};
@@ -133,11 +134,20 @@ fn aov(aov: &api::Aov) -> Aov {
     }
 }
 
-/// What defines an image, for the header of its file: the scene's content, the frame, the number of samples.
+/// What defines an image, for the header of its file: the scene's content, the frame, the number of samples (fewest, most and a hash over all
+/// tiles, where these have different numbers).
 ///
 /// # Errors
 /// When the frame cannot be written down, which is a mistake of Rayherd.
-pub fn definition(manifest: &Manifest, frame: &Frame, spp: u32) -> Result<Map<String, Value>, JobError> {
+pub fn definition(manifest: &Manifest, frame: &Frame, samples: &Samples) -> Result<Map<String, Value>, JobError> {
+    let spp = match samples {
+        Samples::Even(n) => json!(n),
+        Samples::Each(tiles) => {
+            let bytes: Vec<u8> = tiles.iter().flat_map(|n| n.to_le_bytes()).collect();
+            let hash = blake3::hash(&bytes).to_hex();
+            json!({ "least": samples.least(), "most": samples.most(), "tiles": hash.as_str() })
+        }
+    };
     let frame = serde_json::to_value(frame).map_err(|e| JobError::Internal(e.to_string()))?;
     match json!({ "scene": manifest.content, "frame": frame, "spp": spp }) {
         Value::Object(map) => Ok(map),

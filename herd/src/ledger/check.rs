@@ -76,6 +76,9 @@ impl Scope {
         if !snapshot.done.is_sound(MAX_SPP) {
             return Err("its samples are out of order or out of range".into());
         }
+        if snapshot.step.as_ref().is_some_and(|step| !step.is_sound(self.tiles as usize)) {
+            return Err("its step is not one of its film tiles, or out of range".into());
+        }
         if snapshot.commits > record.sequence {
             return Err(format!("it counts {} commits at place {}", snapshot.commits, record.sequence));
         }

@@ -1,6 +1,6 @@
 //! A film summed in memory.
 
-use rayherd_render::film::FilmPart;
+use rayherd_render::film::{ErrorSum, FilmPart, Samples};
 
 use super::attempt::Made;
 use super::journal;
@@ -41,23 +41,26 @@ impl FilmSum for MemoryFilm<'_, '_> {
     fn store(&mut self, name: &str) -> Result<Vec<FilmRef>, JobError> {
         journal::store_film(self.nodes, &self.now, name)
     }
-    fn rel_mse(&mut self, spp: u32) -> Result<Option<f64>, JobError> {
-        Ok(self.now.rel_mse(spp))
+    fn rel_mse(&mut self, samples: &Samples) -> Result<Option<f64>, JobError> {
+        Ok(self.now.rel_mse(samples))
+    }
+    fn tile_errors(&mut self, samples: &Samples) -> Result<Option<Vec<ErrorSum>>, JobError> {
+        Ok(self.now.tile_errors(samples))
     }
     fn needs(&self, _: &str) -> bool {
         // all of it is here
         false
     }
-    fn shown_error(&self, spp: u32) -> Option<f64> {
-        self.now.rel_mse(spp)
+    fn shown_error(&self, samples: &Samples) -> Option<f64> {
+        self.now.rel_mse(samples)
     }
-    fn preview(&self, spp: u32) -> Option<Image> {
-        Some(image(&self.now, spp))
+    fn preview(&self, samples: &Samples) -> Option<Image> {
+        Some(image(&self.now, samples))
     }
 }
 
 /// The picture of a film.
-pub fn image(film: &FilmPart, spp: u32) -> Image {
+pub fn image(film: &FilmPart, samples: &Samples) -> Image {
     let [width, height] = film.size();
-    Image { width, height, pixels: film.resolve(spp) }
+    Image { width, height, pixels: film.resolve(samples) }
 }

@@ -1,6 +1,8 @@
 //! An executor with virtual nodes, in one process.
 
 #[cfg(test)]
+mod allotted;
+#[cfg(test)]
 mod aovs;
 pub mod attempt;
 #[cfg(test)]
@@ -27,7 +29,7 @@ mod threads;
 pub mod usage;
 
 use rayherd_render::aov::Aov;
-use rayherd_render::film::FilmPart;
+use rayherd_render::film::{FilmPart, Samples};
 use rayherd_render::frame::Frame;
 pub use run::render_local;
 
@@ -44,7 +46,7 @@ pub struct JobOutcome {
     /// Its exact sums.
     pub film: FilmPart,
     /// Samples per pixel in it.
-    pub spp: u32,
+    pub samples: Samples,
     /// What was done and counted.
     pub report: Report,
 }

@@ -14,11 +14,13 @@ use super::owner::Ownership;
 use super::slots::Gate;
 use super::threads::Threads;
 use super::{JobOutcome, check, check_copies, journal};
+use crate::allot::total;
 use crate::driver::{Driver, Pointer, Start};
 use crate::job::{JobError, JobSettings, PreparedScene, Progress, Sampling};
 use crate::ledger::Ledger;
 use crate::store::{BlockStore, Spilling};
-use crate::task::camera::tiles;
+use crate::task::camera::{tile_pixels, tiles};
+use crate::wave::Done;
 
 /// Ray groups and film parts of a job without a store that stay in memory; what is more goes to a temporary folder.
 const AT_REST_IN_MEMORY: u64 = 128 << 20;
@@ -71,12 +73,12 @@ pub fn render_local(
     let nodes = &shared.nodes;
     if commits.takeover {
         // what cannot be done must not cost somebody's run
-        may_go_on(&shared, commits.resume, sampling.spp)?;
+        may_go_on(&shared, commits.resume, sampling)?;
     }
     let owner = Ownership::take(nodes.store().clone(), commits.takeover);
     let owner = Arc::new(nodes.wait(owner)?);
-    let result = resume(&shared, &owner, commits.resume, sampling.spp)
-        .and_then(|start| rounds(&shared, start, sampling, progress));
+    let result =
+        resume(&shared, &owner, commits.resume, sampling).and_then(|start| rounds(&shared, start, sampling, progress));
     // the result is what counts: if this fails, the next run finds a dead owner
     if let Err(e) = nodes.wait(owner.give_back()) {
         tracing::warn!("{e}");
@@ -85,26 +87,35 @@ pub fn render_local(
 }
 
 /// Refuses what [`resume`] would refuse, as far as it is known without reading pictures.
-fn may_go_on(shared: &Shared, may_resume: bool, spp: u32) -> Result<(), JobError> {
+fn may_go_on(shared: &Shared, may_resume: bool, sampling: &Sampling) -> Result<(), JobError> {
     let place = shared.nodes.store().describe();
     let records = shared.nodes.wait(journal::read(shared.nodes.store().as_ref()))?;
     if !may_resume && !records.is_empty() {
         return Err(holds_a_job(&place));
     }
     let chain = journal::newest_of(&shared.scene.image_name(shared.frame)?, records)?;
-    let reach = chain.records.iter().rev().find_map(|(_, r)| r.snapshot.as_ref()).map_or(0, |s| s.done.reach());
-    enough(&place, reach, spp)
+    let done = chain.records.iter().rev().find_map(|(_, r)| r.snapshot.as_ref()).map(|s| &s.done);
+    done.map_or(Ok(()), |done| enough(&place, shared, done, sampling))
 }
 
 fn holds_a_job(place: &str) -> JobError {
     JobError::Settings(format!("{place} holds a job already: resume it, or use another store"))
 }
 
-fn enough(place: &str, reach: u32, spp: u32) -> Result<(), JobError> {
-    if reach <= spp {
+/// Refuses fewer samples than there are: than there are on average, where more are shared out.
+fn enough(place: &str, shared: &Shared, done: &Done, sampling: &Sampling) -> Result<(), JobError> {
+    let spp = sampling.spp;
+    let held = match sampling.target_error {
+        None => done.reach(),
+        Some(_) => {
+            let pixels: Vec<u64> = (0..done.tiles()).map(|t| u64::from(tile_pixels(shared.frame, t))).collect();
+            (total(&done.begin(), &pixels) / total(&1.into(), &pixels)) as u32
+        }
+    };
+    if held <= spp {
         return Ok(());
     }
-    let message = format!("{place} holds {reach} samples per pixel, {spp} were asked for: ask for at least as many");
+    let message = format!("{place} holds {held} samples per pixel, {spp} were asked for: ask for at least as many");
     Err(JobError::Settings(message))
 }
 
@@ -113,7 +124,7 @@ fn resume<'n, 'a>(
     shared: &'n Shared<'a>,
     owner: &Arc<Ownership>,
     may_resume: bool,
-    spp: u32,
+    sampling: &Sampling,
 ) -> Result<Start<MemoryFilm<'n, 'a>>, JobError> {
     let nodes = &shared.nodes;
     let place = nodes.store().describe();
@@ -122,7 +133,7 @@ fn resume<'n, 'a>(
     }
     let image = shared.scene.image_name(shared.frame)?;
     let resumed = journal::resume(nodes, &image, &journal::scope(shared.scene, shared.frame), shared.frame.layout())?;
-    enough(&place, resumed.ledger.done().reach(), spp)?;
+    enough(&place, shared, resumed.ledger.done(), sampling)?;
     let (settled, settled_film) = resumed.settled;
     Ok(Start {
         ledger: resumed.ledger,
@@ -171,8 +182,8 @@ fn rounds(
     if let Err(e) = discarded {
         tracing::warn!("what came too late to count was not deleted: {e}");
     }
-    let (film, spp, mut report) = driver.finish()?;
+    let (film, samples, mut report) = driver.finish()?;
     let film = film.into_sum();
     report.note_non_finite(film.size()[0], &film.rejected().keys);
-    Ok(JobOutcome { image: image(&film, spp), film, spp, report })
+    Ok(JobOutcome { image: image(&film, &samples), film, samples, report })
 }

@@ -47,12 +47,12 @@ fn expected(spp: u32) -> Arc<FilmPart> {
         .clone()
 }
 
-fn largest(scene: &PreparedScene) -> u64 {
+pub(super) fn largest(scene: &PreparedScene) -> u64 {
     scene.grid.owning().iter().map(|s| scene.split_bytes(s)).max().unwrap()
 }
 
 /// Small tasks, so that there are many.
-fn small(strategy: Strategy, slots: &[u32]) -> JobSettings {
+pub(super) fn small(strategy: Strategy, slots: &[u32]) -> JobSettings {
     JobSettings {
         strategy,
         nodes: nodes(slots),
@@ -193,14 +193,14 @@ fn a_target_error_ends_a_run_that_a_longer_one_repeats() {
     let target = Sampling { spp: 4096, target_error: Some(0.2), time_limit: None };
     let made = render_local(&SCENES[1], &frame(), &target, &small(Strategy::Auto, &[2]), &Silent).unwrap();
     assert_eq!(made.report.target_reached, Some(true));
-    assert!(made.report.rel_mse.unwrap() <= 0.2 && made.spp < 4096, "{:?}", made.report.rel_mse);
-    assert!(made.film == *expected(made.spp));
+    assert!(made.report.rel_mse.unwrap() <= 0.2 && made.samples.most() < 4096, "{:?}", made.report.rel_mse);
+    assert!(made.film == *expected(made.samples.most()));
     let late = Sampling { spp: 1 << 20, target_error: None, time_limit: Some(0.0) };
     let made = render_local(&SCENES[1], &frame(), &late, &small(Strategy::Auto, &[2]), &Silent).unwrap();
-    assert!(made.film == *expected(made.spp) && made.spp < 100);
+    assert!(made.film == *expected(made.samples.most()) && made.samples.most() < 100);
 }
 
-fn with_store(store: &Arc<MemoryStore>, resume: bool, settings: JobSettings) -> JobSettings {
+pub(super) fn with_store(store: &Arc<MemoryStore>, resume: bool, settings: JobSettings) -> JobSettings {
     let commits = Commits { store: store.clone(), resume, takeover: false };
     JobSettings { commits: Some(commits), ..settings }
 }
@@ -243,9 +243,9 @@ fn more_samples_continue_a_finished_image() {
 }
 
 /// Stops a job by an error after some commits, as a kill would, but for the owner object.
-struct Crash {
-    after: u64,
-    store: Arc<MemoryStore>,
+pub(super) struct Crash {
+    pub(super) after: u64,
+    pub(super) store: Arc<MemoryStore>,
 }
 
 #[async_trait::async_trait]

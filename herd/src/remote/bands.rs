@@ -7,7 +7,7 @@ use std::collections::BTreeSet;
 use std::io::{Seek, Write};
 use std::ops::Range;
 
-use rayherd_render::film::{ErrorSum, FilmPart, KEPT_KEYS, Layout, TILE};
+use rayherd_render::film::{ErrorSum, FilmPart, KEPT_KEYS, Layout, Samples, TILE};
 use serde_json::{Map, Value};
 
 use crate::job::JobError;
@@ -62,7 +62,8 @@ impl Totals {
 }
 
 impl Adder<'_> {
-    fn tiles(&self, band: u32) -> Range<u32> {
+    /// Tiles of a band.
+    pub fn tiles(&self, band: u32) -> Range<u32> {
         let first = band.saturating_mul(self.band);
         first..first.saturating_add(self.band)
     }
@@ -88,7 +89,7 @@ impl Adder<'_> {
     pub fn picture(
         &self,
         parts: &[FilmRef],
-        samples: u32,
+        samples: &Samples,
         offset: [f64; 3],
         definition: &Map<String, Value>,
         out: impl Write + Seek,
@@ -118,7 +119,7 @@ impl Adder<'_> {
     pub fn show(
         &self,
         parts: &[FilmRef],
-        samples: u32,
+        samples: &Samples,
         mut seen: impl FnMut(&[[f32; 3]]) -> Result<(), JobError>,
     ) -> Result<(), JobError> {
         let [width, height] = self.layout.size;
@@ -136,7 +137,7 @@ impl Adder<'_> {
 struct Rows<'a> {
     adder: &'a Adder<'a>,
     parts: &'a [FilmRef],
-    samples: u32,
+    samples: &'a Samples,
     offset: [f64; 3],
     totals: Totals,
     current: Option<(u32, FilmPart)>,
@@ -146,7 +147,7 @@ struct Rows<'a> {
 
 impl<'a> Rows<'a> {
     /// With so many channels beside the picture: all, or none.
-    fn new(adder: &'a Adder, parts: &'a [FilmRef], samples: u32, (offset, beside): ([f64; 3], usize)) -> Self {
+    fn new(adder: &'a Adder, parts: &'a [FilmRef], samples: &'a Samples, (offset, beside): ([f64; 3], usize)) -> Self {
         let rows = Row::new(adder.layout.size[0] as usize * TILE as usize, beside);
         Rows { adder, parts, samples, offset, totals: Totals::default(), current: None, rows }
     }

@@ -284,8 +284,8 @@ fn render(
         return Err(e);
     }
     driver.stop_all();
-    let (film, spp, mut report) = driver.finish()?;
-    let made = film.picture(spp, picture)?;
+    let (film, samples, mut report) = driver.finish()?;
+    let made = film.picture(&samples, picture)?;
     report.note_non_finite(stage.frame.size[0], &made.non_finite);
     let m = &scene.manifest;
     let never = job.fleet.never_read([m.splits.len(), m.tiles.len()]);
@@ -365,7 +365,7 @@ fn resume(nodes: &Nodes, image: &str, scope: &Scope, pointer: Option<(u64, Strin
 
 /// The first of some states whose film is whole; else the one with most in it of those that can be gone back to, and what is lost.
 fn whole(fleet: &Fleet, film: ([u32; 2], u32), states: Vec<Resumed>) -> Result<(Resumed, Option<JobError>), JobError> {
-    let is_whole = |parts: &[FilmRef]| match Parts::new(fleet, film, parts.to_vec(), Vec::new()).look(1) {
+    let is_whole = |parts: &[FilmRef]| match Parts::new(fleet, film, parts.to_vec(), Vec::new()).look(&1.into()) {
         Ok(_) => Ok(None),
         Err(e @ JobError::Lost { .. }) => Ok(Some(e)),
         Err(e) => Err(e),

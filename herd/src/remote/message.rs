@@ -1,7 +1,7 @@
 //! Messages between workers and operator. Small: names, numbers and counts; rays, film and blocks go through the stores.
 
 use rayherd_api::{RenderJobSpec, Strategy};
-use rayherd_render::film::ErrorSum;
+use rayherd_render::film::{ErrorSum, Samples};
 use rayherd_render::frame::Frame;
 use rayherd_render::skip::SkipCounts;
 use rayherd_scene::objects::ObjectRef;
@@ -47,6 +47,9 @@ pub struct Poll {
     /// It makes pictures of films that are not finished.
     #[serde(default)]
     pub previews: bool,
+    /// It knows tiles with samples of their own; workers of earlier versions take one number for all.
+    #[serde(default)]
+    pub tiles: bool,
     /// Which picture it makes of a scene and frame ([`crate::job::PICTURE`]); that of a worker that does not say so is another.
     #[serde(default)]
     pub picture: u32,
@@ -171,19 +174,22 @@ pub enum Work {
         /// What to add.
         parts: Vec<FilmRef>,
         /// Samples per pixel in the sum, for its error and the picture.
-        spp: u32,
+        spp: Samples,
         /// The picture is written under this key of the storage, as OpenEXR, band by band; then nothing else is stored.
         picture: Option<String>,
         /// Only this band of the film; the whole without one.
         #[serde(default)]
         band: Option<u32>,
+        /// The errors of its tiles are told, too.
+        #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+        tiles: bool,
     },
     /// Make a picture of a film that is not finished, for whoever watches. Nobody waits for it.
     Preview {
         /// What to add.
         parts: Vec<FilmRef>,
         /// Samples per pixel, about: what waits or is being made is missing.
-        spp: u32,
+        spp: Samples,
         /// The key of the storage where it is written, as PNG.
         key: String,
         /// Its exposure in stops.
@@ -316,6 +322,9 @@ pub enum Done {
         /// Sum of the errors that relMSE is the mean of.
         #[serde(default)]
         error: Option<ErrorSum>,
+        /// Those of the band's tiles, or of all, if they were asked for and there are any.
+        #[serde(default, skip_serializing_if = "Vec::is_empty")]
+        tiles: Vec<ErrorSum>,
         /// Pixel and sample of the first contributions that were not finite.
         non_finite: Vec<(u32, u32)>,
         /// Where the picture lies, if it was asked for.

@@ -1,5 +1,7 @@
 //! A film that lies in parts on the workers' stores, and is added up by them, band by band.
 
+use rayherd_render::film::{ErrorSum, Samples};
+
 use super::bands::{self, Totals};
 use super::fleet::Fleet;
 use super::message::{Done, Work};
@@ -16,12 +18,13 @@ const MANY: usize = 8;
 pub struct Parts<'f> {
     fleet: &'f Fleet,
     size: [u32; 2],
-    /// How many there are.
+    /// Tiles of a band, and how many bands there are.
+    band: u32,
     bands: u32,
     now: Vec<FilmRef>,
     settled: Vec<FilmRef>,
     /// The last error that was found, and of how many samples; none when the film has changed since.
-    error: Option<(u32, Option<f64>)>,
+    error: Option<(Samples, Option<f64>)>,
     /// Where previews are written, and their exposure in stops.
     shown: Option<(String, f64)>,
 }
@@ -37,7 +40,7 @@ pub struct Pictured {
 impl<'f> Parts<'f> {
     /// A film of `size` pixels in bands of so many tiles whose parts are these; `settled` is what to go back to.
     pub fn new(fleet: &'f Fleet, (size, band): ([u32; 2], u32), now: Vec<FilmRef>, settled: Vec<FilmRef>) -> Self {
-        Parts { fleet, size, bands: bands::count(size, band), now, settled, error: None, shown: None }
+        Parts { fleet, size, band, bands: bands::count(size, band), now, settled, error: None, shown: None }
     }
 
     /// The same, of which previews are made for whoever asks the fleet for them.
@@ -65,8 +68,8 @@ impl<'f> Parts<'f> {
     ///
     /// # Errors
     /// When one of them is lost.
-    pub fn look(&self, spp: u32) -> Result<Option<f64>, JobError> {
-        let work = |(band, parts)| Work::Merge { name: None, parts, spp, picture: None, band };
+    pub fn look(&self, samples: &Samples) -> Result<Option<f64>, JobError> {
+        let work = |(band, parts)| looking(band, parts, samples, false);
         let (mut totals, mut plain) = (Totals::default(), None);
         for done in self.fleet.call_all(self.by_band().map(work).collect())? {
             let Done::Merged { rel_mse, error, .. } = done else { return Err(other()) };
@@ -84,13 +87,18 @@ impl<'f> Parts<'f> {
     ///
     /// # Errors
     /// When a part is lost, or no store takes the picture.
-    pub fn picture(&self, spp: u32, key: &str) -> Result<Pictured, JobError> {
-        let (parts, picture) = (self.now.clone(), Some(key.to_owned()));
-        match self.fleet.call(Work::Merge { name: None, parts, spp, picture, band: None })? {
+    pub fn picture(&self, samples: &Samples, key: &str) -> Result<Pictured, JobError> {
+        let (parts, picture, spp) = (self.now.clone(), Some(key.to_owned()), samples.clone());
+        match self.fleet.call(Work::Merge { name: None, parts, spp, picture, band: None, tiles: false })? {
             Done::Merged { non_finite, picture, .. } => Ok(Pictured { non_finite, at: picture }),
             _ => Err(other()),
         }
     }
+}
+
+/// Work that adds up and stores nothing.
+fn looking(band: Option<u32>, parts: Vec<FilmRef>, samples: &Samples, tiles: bool) -> Work {
+    Work::Merge { name: None, parts, spp: samples.clone(), picture: None, band, tiles }
 }
 
 fn other() -> JobError {
@@ -119,7 +127,7 @@ impl FilmSum for Parts<'_> {
         let (many, few): (Vec<_>, Vec<_>) = by_band.into_iter().partition(|(_, p)| of_all || p.len() > most);
         let work = |(band, parts): (Option<u32>, Vec<FilmRef>)| {
             let name = Some(band.map_or_else(|| name.to_owned(), |b| format!("{name}-b{b:05}")));
-            Work::Merge { name, parts, spp: 1, picture: None, band }
+            Work::Merge { name, parts, spp: 1.into(), picture: None, band, tiles: false }
         };
         let mut now: Vec<FilmRef> = few.into_iter().flat_map(|(_, parts)| parts).collect();
         for done in self.fleet.call_all(many.into_iter().map(work).collect())? {
@@ -129,24 +137,41 @@ impl FilmSum for Parts<'_> {
         self.now = now;
         Ok(self.now.clone())
     }
-    fn rel_mse(&mut self, spp: u32) -> Result<Option<f64>, JobError> {
+    fn rel_mse(&mut self, samples: &Samples) -> Result<Option<f64>, JobError> {
         // nothing to read for an error that there is not
-        if self.now.is_empty() || spp < 2 {
+        if self.now.is_empty() || samples.least() < 2 {
             return Ok(None);
         }
-        if let Some((of, error)) = self.error
-            && of == spp
+        if let Some((of, error)) = &self.error
+            && of == samples
         {
-            return Ok(error);
+            return Ok(*error);
         }
-        let error = self.look(spp)?;
-        self.error = Some((spp, error));
+        let error = self.look(samples)?;
+        self.error = Some((samples.clone(), error));
         Ok(error)
     }
+    fn tile_errors(&mut self, samples: &Samples) -> Result<Option<Vec<ErrorSum>>, JobError> {
+        if samples.least() < 2 {
+            return Ok(None);
+        }
+        let mut all = vec![ErrorSum::default(); bands::count(self.size, 1) as usize];
+        let by_band: Vec<_> = self.by_band().collect();
+        let first = |band: &Option<u32>| band.map_or(0, |b| b as usize * self.band as usize);
+        let firsts: Vec<usize> = by_band.iter().map(|(band, _)| first(band)).collect();
+        let work = |(band, parts)| looking(band, parts, samples, true);
+        for (first, done) in firsts.into_iter().zip(self.fleet.call_all(by_band.into_iter().map(work).collect())?) {
+            let Done::Merged { tiles, .. } = done else { return Err(other()) };
+            all.get_mut(first..first + tiles.len()).ok_or_else(other)?.copy_from_slice(&tiles);
+        }
+        self.error = Some((samples.clone(), Some(ErrorSum::total(&all).mean(self.size))));
+        Ok(Some(all))
+    }
     /// A worker makes it, when it has nothing else to do: there is no picture here.
-    fn preview(&self, spp: u32) -> Option<Image> {
+    fn preview(&self, samples: &Samples) -> Option<Image> {
         if let Some((key, exposure)) = self.shown.clone().filter(|_| !self.now.is_empty()) {
-            self.fleet.preview(Work::Preview { parts: self.now.clone(), spp, key, exposure });
+            let (parts, spp) = (self.now.clone(), samples.clone());
+            self.fleet.preview(Work::Preview { parts, spp, key, exposure });
         }
         None
     }

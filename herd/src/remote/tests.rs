@@ -201,8 +201,8 @@ fn local_files(spec: &RenderJobSpec) -> (Vec<u8>, Vec<u8>, report::Report) {
     let spp = from_spec::samples(spec, &scene.manifest);
     let sampling = Sampling { spp, target_error: spec.sampling.target_error, time_limit: None };
     let out = render_local(&scene, &frame, &sampling, &JobSettings::default(), &Silent).unwrap();
-    let definition = from_spec::definition(&scene.manifest, &frame, out.spp).unwrap();
-    let layers = out.film.channels(out.spp, scene.manifest.offset);
+    let definition = from_spec::definition(&scene.manifest, &frame, &out.samples).unwrap();
+    let layers = out.film.channels(&out.samples, scene.manifest.offset);
     let shown = png_file::encode(&out.image, spec.image.exposure.unwrap_or(0.0)).unwrap();
     (picture::encode(&out.image, &layers, &definition).unwrap(), shown, out.report)
 }
@@ -344,6 +344,7 @@ pub(super) fn poll(number: u32, session: &str) -> Poll {
         aovs: true,
         builds: true,
         previews: true,
+        tiles: true,
         picture: PICTURE,
         holds: None,
     }

@@ -13,6 +13,7 @@ mod bounded;
 mod code;
 mod planes;
 mod resolve;
+mod samples;
 #[cfg(test)]
 mod tests;
 
@@ -22,6 +23,7 @@ use std::ops::Range;
 pub use bounded::BoundedFilm;
 pub use code::FilmError;
 pub use resolve::{Channel, ErrorSum};
+pub use samples::{PerTile, Samples};
 
 use crate::aov::Aovs;
 use planes::Planes;

@@ -4,7 +4,7 @@ use std::ops::AddAssign;
 
 use serde::{Deserialize, Serialize};
 
-use super::{FilmPart, Sums, TILE};
+use super::{FilmPart, PerTile, Sums, TILE, Tile};
 use crate::aov::Aov;
 
 /// 2^-64, in which sums of errors are counted as sums of light are.
@@ -17,9 +17,26 @@ const UNIT: f64 = 1.0 / 18_446_744_073_709_551_616.0;
 pub struct ErrorSum(u128);
 
 impl ErrorSum {
+    /// A sum, which is not negative and below 2^36; what is below a unit is cut off.
+    pub fn of(value: f64) -> ErrorSum {
+        ErrorSum((value / UNIT) as u128)
+    }
+
+    /// The sum itself.
+    pub fn value(self) -> f64 {
+        self.0 as f64 * UNIT
+    }
+
+    /// Of all parts of a film.
+    pub fn total(parts: &[ErrorSum]) -> ErrorSum {
+        let mut sum = ErrorSum::default();
+        parts.iter().for_each(|&part| sum += part);
+        sum
+    }
+
     /// The mean over the channels of all pixels of a film.
     pub fn mean(self, [width, height]: [u32; 2]) -> f64 {
-        self.0 as f64 * UNIT / (3.0 * f64::from(width) * f64::from(height))
+        self.value() / (3.0 * f64::from(width) * f64::from(height))
     }
 }
 
@@ -54,12 +71,12 @@ pub struct Channel {
 impl FilmPart {
     /// The picture after `samples` samples per pixel (at least 1): sum / samples, exact, rounded once to the nearest float. Row by row, width *
     /// height pixels of RGB.
-    pub fn resolve(&self, samples: u32) -> Vec<[f32; 3]> {
+    pub fn resolve(&self, samples: impl PerTile) -> Vec<[f32; 3]> {
         let mut out = Vec::with_capacity(self.size[0] as usize * self.size[1] as usize);
         for y in 0..self.size[1] {
             for x in 0..self.size[0] {
-                let [a, b] = self.sums(x, y);
-                out.push(std::array::from_fn(|c| quotient(a[c].wrapping_add(b[c]), samples)));
+                let ([a, b], n) = (self.sums(x, y), samples.of_tile(self.place_at(x, y).0));
+                out.push(std::array::from_fn(|c| quotient(a[c].wrapping_add(b[c]), n)));
             }
         }
         out
@@ -69,30 +86,36 @@ impl FilmPart {
     /// Var / (M^2 + 0.01), M being the mean of all samples and Var the estimate of its variance from the means A and B of the two halves:
     /// (A - B)^2 n_A n_B / n^2, which is (A - B)^2 / 4 when both have the same number; of an odd number the even
     /// half has one more. `None` for fewer than two samples: one half is empty.
-    pub fn rel_mse(&self, samples: u32) -> Option<f64> {
+    pub fn rel_mse(&self, samples: impl PerTile) -> Option<f64> {
         Some(self.error_sum(samples)?.mean(self.size))
     }
 
-    /// What [`FilmPart::rel_mse`] is the mean of: tiles that were not touched have no error.
-    pub fn error_sum(&self, samples: u32) -> Option<ErrorSum> {
-        let mut sum = ErrorSum::default();
-        for tile in self.tiles.iter().flatten() {
-            let mut of_tile = 0.0;
-            for sums in tile.0.iter() {
-                of_tile += pixel_error(sums, samples)?;
+    /// What [`FilmPart::rel_mse`] is the mean of.
+    pub fn error_sum(&self, samples: impl PerTile) -> Option<ErrorSum> {
+        self.tile_errors(samples).map(|errors| ErrorSum::total(&errors))
+    }
+
+    /// The same by tile: those that were not touched have no error. `None` where a tile has fewer than two samples.
+    pub fn tile_errors(&self, samples: impl PerTile) -> Option<Vec<ErrorSum>> {
+        let of_tile = |(number, tile): (usize, &Option<Tile>)| {
+            let n = samples.of_tile(number);
+            let mut error = 0.0;
+            for sums in tile.iter().flat_map(|tile| tile.0.iter()) {
+                error += pixel_error(sums, n)?;
             }
             // below 2^13, and not negative
-            sum += ErrorSum((of_tile / UNIT) as u128);
-        }
-        (samples >= 2).then_some(sum)
+            (n >= 2).then_some(ErrorSum::of(error))
+        };
+        self.tiles.iter().enumerate().map(of_tile).collect()
     }
 
     /// The picture's pixels in a tile, as [`FilmPart::resolve`] has them: column, row and value of each; none where nothing was touched.
-    pub fn resolve_tile(&self, number: u32, samples: u32, mut put: impl FnMut(u32, u32, [f32; 3])) {
+    pub fn resolve_tile(&self, number: u32, samples: impl PerTile, mut put: impl FnMut(u32, u32, [f32; 3])) {
         let Some(tile) = &self.tiles[number as usize] else { return };
+        let n = samples.of_tile(number as usize);
         self.pixels_of(number, |x, y, at| {
             let [a, b] = &tile.0[at];
-            put(x, y, std::array::from_fn(|c| quotient(a[c].wrapping_add(b[c]), samples)));
+            put(x, y, std::array::from_fn(|c| quotient(a[c].wrapping_add(b[c]), n)));
         });
     }
 
@@ -109,11 +132,12 @@ impl FilmPart {
     }
 
     /// The same per pixel, mean over its channels, row by row.
-    pub fn rel_mse_map(&self, samples: u32) -> Option<Vec<f32>> {
+    pub fn rel_mse_map(&self, samples: impl PerTile) -> Option<Vec<f32>> {
         let mut out = Vec::with_capacity(self.size[0] as usize * self.size[1] as usize);
         for y in 0..self.size[1] {
             for x in 0..self.size[0] {
-                out.push((pixel_error(self.sums(x, y), samples)? / 3.0) as f32);
+                let n = samples.of_tile(self.place_at(x, y).0);
+                out.push((pixel_error(self.sums(x, y), n)? / 3.0) as f32);
             }
         }
         Some(out)
@@ -121,12 +145,12 @@ impl FilmPart {
 
     /// The channels of its AOVs after `samples` samples per pixel (at least 1), in the order of [`crate::aov::Aovs::channels`]; see [`Aov`] for what they
     /// mean. `offset` is what was taken from the scene's coordinates to recentre them: positions get it back, in f64, before they are rounded.
-    pub fn channels(&self, samples: u32, offset: [f64; 3]) -> Vec<Channel> {
+    pub fn channels(&self, samples: impl PerTile, offset: [f64; 3]) -> Vec<Channel> {
         let pixels = self.size[0] as usize * self.size[1] as usize;
         let empty = |name| Channel { name, values: vec![0.0; pixels] };
         let mut out: Vec<Channel> = self.aovs().channels().map(empty).collect();
         for tile in 0..self.tiles() as u32 {
-            self.channels_of_tile(tile, samples, offset, |x, y, channel, value| {
+            self.channels_of_tile(tile, &samples, offset, |x, y, channel, value| {
                 out[channel].values[y as usize * self.size[0] as usize + x as usize] = value;
             });
         }
@@ -137,10 +161,11 @@ impl FilmPart {
     pub fn channels_of_tile(
         &self,
         number: u32,
-        samples: u32,
+        samples: impl PerTile,
         offset: [f64; 3],
         mut put: impl FnMut(u32, u32, usize, f32),
     ) {
+        let samples = samples.of_tile(number as usize);
         let mut first = 0;
         for aov in self.aovs().iter() {
             let channels = aov.channels().len();

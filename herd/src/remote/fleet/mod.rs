@@ -445,6 +445,7 @@ fn give(state: &mut State, poll: &Poll) -> Result<Answer, Unknown> {
         (What::Attempt { task, number, stop }, work)
     } else if poll.clerk
         && poll.previews
+        && poll.tiles
         && let Some(work) = state.preview.waiting.take()
     {
         state.preview.made = true;

@@ -3,6 +3,8 @@
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::time::{Duration, Instant};
 
+use rayherd_render::film::Samples;
+
 use super::super::deaths::{Deaths, Held, MOST_DEATHS};
 use super::super::message::{Beat, Done, Failure, Holds, Poll, Stage, Work, WorkerId};
 use super::preview::Preview;
@@ -143,7 +145,9 @@ impl State {
     /// beside it come first.
     pub fn common_for(&self, poll: &Poll) -> Option<usize> {
         let can = |work: &Work| match work {
-            Work::Merge { band: Some(_), .. } => poll.bands,
+            Work::Merge { band, spp, tiles, .. } => {
+                (poll.bands || band.is_none()) && (poll.tiles || !(*tiles || matches!(spp, Samples::Each(_))))
+            }
             // slots alone, so that as many trees are in memory as there are slots
             Work::Build { .. } => poll.builds && !poll.clerk,
             Work::Prepare { beside, .. } => is_beside(beside, poll.home) || !self.has_beside(beside),

@@ -68,7 +68,7 @@ fn a_preview_is_made_by_a_clerk_at_most_once_and_keeps_nobody() {
     let slot = poll(0, "s");
     let clerk = Poll { clerk: true, ..slot.clone() };
     let old = Poll { previews: false, ..clerk.clone() };
-    let work = Work::Preview { parts: Vec::new(), spp: 1, key: "k".into(), exposure: 0.0 };
+    let work = Work::Preview { parts: Vec::new(), spp: 1.into(), key: "k".into(), exposure: 0.0 };
     let answer = |poll: &Poll| given(fleet.answer(poll).unwrap());
     assert!(!fleet.wants_preview(Duration::ZERO), "nobody asks");
     fleet.show(true);
@@ -130,6 +130,10 @@ fn work_whose_answer_was_lost_on_its_way_is_given_out_again() {
     });
 }
 
+fn merged(rel_mse: Option<f64>) -> Done {
+    Done::Merged { film: None, rel_mse, error: None, tiles: vec![], non_finite: vec![], picture: vec![] }
+}
+
 #[test]
 fn a_worker_that_comes_back_under_another_session_loses_only_its_tasks() {
     let fleet = Fleet::new(1, "e");
@@ -137,7 +141,7 @@ fn a_worker_that_comes_back_under_another_session_loses_only_its_tasks() {
     assert_eq!(fleet.answer(&poll("a")), Ok(Answer::Wait));
     assert!(fleet.answer(&crate::remote::tests::poll(1, "a")).is_err());
     std::thread::scope(|scope| {
-        let work = Work::Merge { name: None, parts: vec![], spp: 1, picture: None, band: None };
+        let work = Work::Merge { name: None, parts: vec![], spp: 1.into(), picture: None, band: None, tiles: false };
         let call = scope.spawn(|| fleet.call(work));
         let handed = |session: &str| {
             let since = Instant::now();
@@ -155,7 +159,7 @@ fn a_worker_that_comes_back_under_another_session_loses_only_its_tasks() {
         let report = |session: &str, id: &str, rel_mse| Report {
             worker: WorkerId { number: 0, session: session.into() },
             id: id.into(),
-            result: Ok(Done::Merged { film: None, rel_mse, error: None, non_finite: vec![], picture: vec![] }),
+            result: Ok(merged(rel_mse)),
             cpu: 0.5,
             bytes: vec![],
             reads: Default::default(),

@@ -1,9 +1,10 @@
 //! Parts of the film added up: to other parts, to previews and to the picture.
 
 use std::io::BufWriter;
+use std::ops::Range;
 use std::path::Path;
 
-use rayherd_render::film::ErrorSum;
+use rayherd_render::film::{ErrorSum, Samples};
 
 use super::super::bands::Adder;
 use super::super::message::{Done, Stage};
@@ -38,7 +39,7 @@ impl Station<'_> {
         shared: &Shared,
         name: Option<&str>,
         (parts, band): (&[FilmRef], Option<u32>),
-        spp: u32,
+        (spp, tiles): (&Samples, bool),
     ) -> Result<Done, JobError> {
         let sum = adder.sum(parts, band)?;
         let film = match name {
@@ -51,7 +52,14 @@ impl Station<'_> {
             _ => None,
         };
         let non_finite = sum.rejected().keys.iter().copied().collect();
-        Ok(merged(adder, film, sum.error_sum(spp), non_finite, Vec::new()))
+        let errors = sum.tile_errors(spp);
+        let error = errors.as_deref().map(ErrorSum::total);
+        let errors = errors.filter(|_| tiles).unwrap_or_default();
+        let of_band = band.map_or(0..errors.len(), |b| {
+            let Range { start, end } = adder.tiles(b);
+            errors.len().min(start as usize)..errors.len().min(end as usize)
+        });
+        Ok(merged(adder, film, (error, errors[of_band].to_vec()), non_finite, Vec::new()))
     }
 
     /// Makes a PNG of a film that is not finished, in a file of our own, then puts it on the stores that take it.
@@ -59,7 +67,7 @@ impl Station<'_> {
         &self,
         adder: &Adder,
         parts: &[FilmRef],
-        spp: u32,
+        spp: &Samples,
         (key, exposure): (&str, f64),
         stop: &StopFlag,
     ) -> Result<Done, JobError> {
@@ -87,7 +95,7 @@ impl Station<'_> {
         adder: &Adder,
         (stage, shared): (&Stage, &Shared),
         parts: &[FilmRef],
-        spp: u32,
+        spp: &Samples,
         (key, stop): (&str, &StopFlag),
     ) -> Result<Done, JobError> {
         let io = |e| self.no_room(e);
@@ -129,7 +137,7 @@ impl Station<'_> {
         }
         match error {
             Some(e) if at.is_empty() => Err(e.into()),
-            _ => Ok(merged(adder, None, totals.error, totals.non_finite.into_iter().collect(), at)),
+            _ => Ok(merged(adder, None, (totals.error, Vec::new()), totals.non_finite.into_iter().collect(), at)),
         }
     }
 
@@ -142,9 +150,9 @@ impl Station<'_> {
 fn merged(
     adder: &Adder,
     film: Option<FilmRef>,
-    error: Option<ErrorSum>,
+    (error, tiles): (Option<ErrorSum>, Vec<ErrorSum>),
     non_finite: Vec<(u32, u32)>,
     picture: Vec<String>,
 ) -> Done {
-    Done::Merged { film, rel_mse: error.map(|e| e.mean(adder.layout.size)), error, non_finite, picture }
+    Done::Merged { film, rel_mse: error.map(|e| e.mean(adder.layout.size)), error, tiles, non_finite, picture }
 }

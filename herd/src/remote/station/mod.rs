@@ -323,6 +323,7 @@ impl<'l> Station<'l> {
                 aovs: true,
                 builds: true,
                 previews: true,
+                tiles: true,
                 picture: PICTURE,
                 holds: open.and_then(Opened::holds),
             };

@@ -39,20 +39,20 @@ impl Station<'_> {
                 let attempt::Made { outputs, hops, skipped, profile, .. } = made;
                 Ok(Done::Made { outputs, hops, skipped, profile: profile.map(Box::new) })
             }
-            Work::Merge { name, parts, spp, picture, band } => {
+            Work::Merge { name, parts, spp, picture, band, tiles } => {
                 let (stage, shared) = open()?;
                 let read = self.reads_film(stage, shared, stop);
                 let adder = Adder { layout: stage.frame.layout(), band: stage.band, read: &read };
                 match picture {
-                    Some(key) => self.picture(&adder, (stage, shared), parts, *spp, (key, stop)),
-                    None => self.merge(&adder, shared, name.as_deref(), (parts, *band), *spp),
+                    Some(key) => self.picture(&adder, (stage, shared), parts, spp, (key, stop)),
+                    None => self.merge(&adder, shared, name.as_deref(), (parts, *band), (spp, *tiles)),
                 }
             }
             Work::Preview { parts, spp, key, exposure } => {
                 let (stage, shared) = open()?;
                 let read = self.reads_film(stage, shared, stop);
                 let adder = Adder { layout: stage.frame.layout(), band: stage.band, read: &read };
-                self.preview(&adder, parts, *spp, (key, *exposure), stop)
+                self.preview(&adder, parts, spp, (key, *exposure), stop)
             }
             Work::Copy { objects, gone } => {
                 let (_, shared) = open()?;

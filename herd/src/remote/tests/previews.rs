@@ -102,7 +102,7 @@ fn a_job_is_seen_while_it_runs_if_somebody_asks_and_nothing_of_that_stays() {
                 let records = cluster.runtime.block_on(journal::read(&part)).unwrap();
                 let last = records.values().max_by_key(|r| r.sequence).and_then(|r| r.snapshot.clone()).unwrap();
                 let (key, exposure) = ("by-hand.png".to_owned(), 0.5);
-                fleet.preview(Work::Preview { parts: last.film, spp: 6, key: key.clone(), exposure });
+                fleet.preview(Work::Preview { parts: last.film, spp: 6.into(), key: key.clone(), exposure });
                 let get = || cluster.runtime.block_on(cluster.stores[1].get(&key));
                 wait_for(|| get().is_ok());
                 assert_eq!(texels(&get().unwrap()), texels(&shown));

@@ -1,6 +1,9 @@
 //! Workers of earlier versions, and what they have begun.
 
+use rayherd_render::film::Samples;
+
 use super::*;
+use crate::remote::Work;
 
 /// A job that a version without bands has begun, whose film is stored as a whole, goes on by bands; and what it stores of its film does not
 /// pile up.
@@ -39,6 +42,43 @@ fn a_film_that_was_stored_in_other_parts_goes_on() {
     }
 }
 
+fn merge(band: Option<u32>, spp: Samples, tiles: bool) -> Work {
+    Work::Merge { name: None, parts: vec![], spp, picture: None, band, tiles }
+}
+
+/// Workers of a version that has one number of samples for all tiles cannot read others, and tell no errors of tiles.
+#[test]
+fn a_worker_that_knows_no_samples_by_tile_is_given_none() {
+    let fleet = Fleet::new(2, "e");
+    let poll = |number: u32, tiles: bool| {
+        let mut text = serde_json::to_value(poll(number, "a")).unwrap();
+        if !tiles {
+            // as it is written where the word is not known
+            text.as_object_mut().unwrap().remove("tiles");
+        }
+        serde_json::from_value::<Poll>(text).unwrap()
+    };
+    let given = |number, tiles| match fleet.answer(&poll(number, tiles)).unwrap() {
+        Answer::Work { work, .. } => Some(*work),
+        _ => None,
+    };
+    let each = Samples::of(vec![16, 24]);
+    let works = [merge(None, each, false), merge(None, 16.into(), true), merge(None, 16.into(), false)];
+    assert!(!serde_json::to_string(&works[2]).unwrap().contains("tiles"), "as it always was");
+    std::thread::scope(|scope| {
+        let call = scope.spawn(|| fleet.call_all(works.to_vec()));
+        let old = std::cell::OnceCell::new();
+        wait_for(|| given(0, false).is_some_and(|work| old.set(work).is_ok()));
+        assert_eq!(old.get(), Some(&works[2]));
+        assert_eq!(
+            (given(0, false), given(1, true), given(1, true)),
+            (None, Some(works[0].clone()), Some(works[1].clone()))
+        );
+        fleet.cancel("enough");
+        assert!(matches!(call.join().unwrap(), Err(JobError::Owned(_))));
+    });
+}
+
 /// Workers of a version without bands would add the whole of a part to each band: as long as one is there, films are added up whole, and
 /// it gets nothing else.
 #[test]
@@ -54,7 +94,7 @@ fn a_worker_that_knows_no_bands_is_given_none() {
         serde_json::from_value::<Poll>(map.into()).unwrap()
     };
     assert!(fleet.knows_bands());
-    let merge = |band| super::super::Work::Merge { name: None, parts: vec![], spp: 1, picture: None, band };
+    let merge = |band| merge(band, 1.into(), false);
     let given = |number, bands| match fleet.answer(&poll(number, bands)).unwrap() {
         Answer::Work { work, .. } => Some(*work),
         _ => None,
@@ -141,7 +181,7 @@ fn a_worker_that_knows_no_layers_or_makes_another_picture_gets_nothing_of_what_i
         assert!(cluster.picture(1) == expected(&spec), "{word}, layers: {layers}");
         let works = works.lock().unwrap();
         // a scene is the same with and without
-        let of_stage = works.iter().filter(|w| !matches!(w, super::super::Work::Prepare { .. })).count();
+        let of_stage = works.iter().filter(|w| !matches!(w, Work::Prepare { .. })).count();
         assert_eq!(of_stage > 0, fits, "{works:?}");
     }
 }
