@@ -21,7 +21,7 @@ impl<F: FilmSum> Driver<'_, '_, F> {
         while !self.is_all_queued() {
             let wait = self.sampling.target_error.is_some() && !(self.ledger.is_quiet() && self.running.is_empty());
             // of a run that goes on: what an earlier one began of a step is to be queued, and all of it may be under way
-            let first = !self.begun && !(wait && self.is_under_way());
+            let first = !(self.begun || wait && self.is_under_way());
             let enough = limited && (!self.cameras.is_empty() || (!first && !self.is_all_taken()));
             if !first && (wait || self.is_late() || enough || self.cameras.units() > QUEUED_UNITS) {
                 return Ok(());

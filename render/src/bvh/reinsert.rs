@@ -281,7 +281,7 @@ mod tests {
     fn boxes(rng: &mut Rng, n: usize) -> Vec<Aabb> {
         let one = |i: usize, rng: &mut Rng| {
             // few are large
-            let size = rng.vec3(if i % 7 == 0 { 5.0 } else { 0.3 }).abs();
+            let size = rng.vec3(if i.is_multiple_of(7) { 5.0 } else { 0.3 }).abs();
             let p = rng.vec3(10.0);
             Aabb { lo: (p - size).to_array(), hi: (p + size).to_array() }
         };
