@@ -2,7 +2,7 @@
 
 Error is relMSE = mean((I - R)^2 / (R^2 + 0.01)) with the reference's own noise subtracted; the reference is Mitsuba's, in two halves, so that its
 noise is known. Time is CPU seconds of a process from its start (all threads), its wall seconds beside it, and the CPU of rendering alone. Each
-renderer is used as it comes; Mitsuba's kernel cache is filled first.
+renderer is used as it comes; Mitsuba's kernel cache is filled first. Cycles (by_cycles.py) runs with its light tree and without.
 """
 import argparse
 import csv
@@ -34,6 +34,8 @@ DRAWS = 1000
 SCENES = ["cornell", "gyroid", "staircase", "living-room", "veach-mis", "classroom", *scenes.MANY_LIGHTS, "ajar-door"]
 # Mitsuba takes hours to a reference of these: theirs is Rayherd's, of other seeds; that the means agree is for tests/accuracy/run to show
 OWN_REFERENCE = {*scenes.MANY_LIGHTS, "ajar-door"}
+# whose surfaces and lamps Cycles has too
+FOR_CYCLES = {"cornell", "gyroid", *scenes.MANY_LIGHTS}
 
 MITSUBA = """
 import resource, sys, numpy as np, mitsuba as mi
@@ -56,9 +58,19 @@ class Renderer:
     def __init__(self, name: str, variant: str | None):
         self.name, self.variant = name, variant
 
+    def is_cycles(self) -> bool:
+        return self.name.startswith("cycles")
+
     def render(self, a, name: str, xml: Path, spp: int, seed: int) -> dict:
         """CPU, wall and CPU without start and loading, and the image."""
         out, report = a.work / f"bench-{self.name}.npy", a.work / "bench.json"
+        if self.is_cycles():
+            told, exr, here = a.work / f"{name}-cycles.npz", a.work / "bench-cycles.exr", Path(__file__).with_name("by_cycles.py")
+            if not told.exists():
+                values = [f"{k}={v}" for k, v in scenes.parameters(xml, SIZE, a.max_depth).items()]
+                run([sys.executable, here, "export", xml, told, *values])
+            cpu, wall, text = run([sys.executable, here, "render", told, exr, SIZE, spp, seed, a.max_depth, int(self.variant == "tree")])
+            return {"cpu": cpu, "wall": wall, "render": float(text.split()[-1]), "image": read_exr(exr)}
         if self.variant is None:
             exr = a.work / "bench.exr"
             command = [a.rayherd, "render", str(xml), "--size", f"{SIZE}x{SIZE}", "--spp", str(spp), "--seed", str(seed),
@@ -77,6 +89,7 @@ class Renderer:
 
 
 RENDERERS = [Renderer("rayherd", None), Renderer("llvm", "llvm_ad_rgb"), Renderer("scalar", "scalar_rgb")]
+CYCLES = [Renderer("cycles-tree", "tree"), Renderer("cycles", "plain")]
 
 
 def read_exr(path: Path) -> np.ndarray:
@@ -230,17 +243,20 @@ def main() -> None:
     p.add_argument("--spp", default="16,64,256,1024", type=lambda s: [int(x) for x in s.split(",")])
     p.add_argument("--repeats", type=int, default=3)
     p.add_argument("--max-depth", type=int, default=8)
-    p.add_argument("--without", action="append", default=[], help="a renderer to leave out: llvm or scalar")
+    p.add_argument("--without", action="append", default=[], help="a renderer to leave out: llvm, scalar, cycles-tree or cycles")
+    p.add_argument("--cycles", action="store_true", help=f"Cycles too, where it has what the scene has: {', '.join(sorted(FOR_CYCLES))}")
     a = p.parse_args()
     a.work, a.shared = a.work.resolve(), a.shared.resolve()
     a.work.mkdir(parents=True, exist_ok=True)
     a.results.mkdir(parents=True, exist_ok=True)
-    renderers = [r for r in RENDERERS if r.name not in a.without]
     rows = []
     for name in a.names:
         xml = scenes.prepare(name, a.shared, a.work, a.rayherd)
         target = TARGETS.get(name, TARGET)
         ref = reference(a, name, xml, target)
+        renderers = [r for r in RENDERERS if r.name not in a.without]
+        if a.cycles and name in FOR_CYCLES:
+            renderers += [r for r in CYCLES if r.name not in a.without]
         for r in renderers:
             r.render(a, name, xml, 1, 0)  # fills kernel and page caches
         for repeat in range(a.repeats):

@@ -14,8 +14,8 @@ const NEVER: i32 = 65535;
 #[command(next_help_heading = "Skipping")]
 pub struct SkipOptions {
     /// Do what the scene does not need, to see what leaving it out saves: cells, beaten, walk, splits, attributes, textures, shadows,
-    /// lights, lobes, details, sky, merged, roulette, aovs, film, prepared, volume or all; repeatable. But for lights and roulette the image
-    /// stays the same bytes
+    /// lights, lobes, details, sky, merged, roulette, aovs, film, tiles, prepared, volume or all; repeatable. But for lights, roulette and
+    /// tiles the image stays the same bytes
     #[arg(long, value_name = "NAME", value_parser = switched_off)]
     no_skip: Vec<Off>,
 }

@@ -23,7 +23,7 @@ const PASSES: usize = 3;
 /// Deeper trees are not kept: what walks them is recursive, and so is the traversal's stack bound. [`super::sah`] makes none.
 const MAX_DEPTH: usize = 96;
 
-/// The same boxes in a tree of at most the same cost.
+/// The same boxes in a tree of at most the same cost. Of `max_leaf` boxes that may share a leaf, those that best do stay together.
 pub(super) fn improved(tree: BinaryTree, max_leaf: u32) -> BinaryTree {
     let mut upper = Upper::of(&tree, NODES, max_leaf);
     let mut moved = false;
