@@ -150,7 +150,7 @@ def surface(bpy, of: dict):
 
     if "squares" in of:
         shown = node("ShaderNodeBsdfDiffuse")
-        checker = node("ShaderNodeTexChecker", Scale=1.0, Color1=(*of["squares"][0], 1), Color2=(*of["squares"][1], 1))
+        checker = node("ShaderNodeTexChecker", Scale=1.0, Color1=(*of["squares"][1], 1), Color2=(*of["squares"][0], 1))
         times = node("ShaderNodeMapping")
         # two squares where Mitsuba's pattern repeats once
         times.inputs["Scale"].default_value = (2 * of["times"][0], 2 * of["times"][1], 1)
