@@ -30,6 +30,15 @@ pub(crate) fn spacious<T>(count: usize) -> Vec<T> {
     values
 }
 
+/// So many zeros, in huge pages if they are many and the system has them; as fresh memory is zero, none is written.
+pub(crate) fn zeros<T: bytemuck::Zeroable>(count: usize) -> Vec<T> {
+    let mut values: Vec<T> = bytemuck::zeroed_vec(count);
+    let room = std::ptr::slice_from_raw_parts_mut(values.as_mut_ptr().cast(), count);
+    // SAFETY: the vector's own values, borrowed mutably; `widen` writes nothing.
+    widen::<T>(unsafe { &mut *room });
+    values
+}
+
 /// Asks for huge pages for memory that nothing was written to, if it is large and the system has them. A hint: what was written before keeps its pages.
 pub fn widen<T>(room: &mut [std::mem::MaybeUninit<T>]) {
     let bytes = size_of_val(room);
@@ -56,6 +65,8 @@ mod tests {
             assert!(values.capacity() >= count);
             values.extend(0..count as u32);
             assert!(values.iter().enumerate().all(|(i, &v)| v == i as u32));
+            let zeros: Vec<u32> = zeros(count);
+            assert!(zeros.len() == count && zeros.iter().all(|&v| v == 0));
         }
     }
 }

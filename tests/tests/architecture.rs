@@ -253,6 +253,7 @@ fn unsafe_stays_in_named_modules() {
     let named = [
         "render/src/bvh/arena.rs",
         "render/src/bvh/trace/",
+        "render/src/bvh/wide.rs",
         "render/src/light/wide.rs",
         "render/src/path/wide.rs",
         "render/src/memory.rs",

@@ -10,15 +10,16 @@ use obvhs::bvh2::reinsertion::ReinsertionOptimizer;
 use obvhs::ploc::PlocBuilder;
 
 use super::Serial;
+use super::binary::{BinaryNode, BinaryTree};
 use super::layout::Aabb;
-use super::sah::{self, BinaryNode, BinaryTree};
+use super::sah;
 
 /// Deeper trees are not kept: what walks them is recursive, and so is the traversal's stack bound.
 const MAX_DEPTH: usize = 128;
 
 /// The better of the two trees. Needs at least one box, as [`sah::build`] does.
 pub(super) fn build(boxes: &[Aabb]) -> BinaryTree {
-    let binned = sah::build(boxes.iter().copied(), &Serial);
+    let binned = sah::build(boxes, 1, &Serial);
     // nothing to choose
     if boxes.len() < 3 {
         return binned;
@@ -31,7 +32,7 @@ pub(super) fn build(boxes: &[Aabb]) -> BinaryTree {
 
 /// Expected visits of a ray that meets the root: areas of the inner nodes (surface area heuristic; leaves are the same in both).
 fn cost(tree: &BinaryTree) -> f64 {
-    tree.nodes.iter().filter(|n| n.count > 1).map(|n| f64::from(n.aabb.half_area())).sum()
+    tree.nodes.iter().filter(|n| !n.is_leaf()).map(|n| f64::from(n.aabb.half_area())).sum()
 }
 
 fn agglomerated(boxes: &[Aabb]) -> Option<BinaryTree> {
@@ -45,7 +46,8 @@ fn agglomerated(boxes: &[Aabb]) -> Option<BinaryTree> {
 
     let counts = counts(&bvh)?;
     let blank = BinaryNode { aabb: Aabb::EMPTY, child: 0, count: 0 };
-    let mut out = BinaryTree { nodes: vec![blank; 2 * boxes.len() - 1], order: Vec::with_capacity(boxes.len()) };
+    let nodes = vec![blank; 2 * boxes.len() - 1];
+    let mut out = BinaryTree::new(nodes, Vec::with_capacity(boxes.len()));
     copy(&bvh, &counts, boxes, 0, &mut out, 0, 1);
     (out.order.len() == boxes.len()).then_some(out)
 }
@@ -92,7 +94,8 @@ fn copy(bvh: &Bvh2, counts: &[u32], boxes: &[Aabb], from: usize, out: &mut Binar
         let b = copy(bvh, counts, boxes, child + 1, out, base as usize + 1, second_below);
         a.union(&b)
     };
-    out.nodes[to] = BinaryNode { aabb, child: base, count };
+    let child = if n.is_leaf() { 0 } else { base - to as u32 };
+    out.nodes[to] = BinaryNode { aabb, child, count };
     aabb
 }
 
@@ -118,11 +121,12 @@ mod tests {
                 next += 1;
                 continue;
             }
-            let (a, b) = (&tree.nodes[n.child as usize], &tree.nodes[n.child as usize + 1]);
+            let child = tree.child(node as u32) as usize;
+            let (a, b) = (&tree.nodes[child], &tree.nodes[child + 1]);
             assert_eq!(a.count + b.count, n.count);
             let both = a.aabb.union(&b.aabb);
             assert_eq!((n.aabb.lo, n.aabb.hi), (both.lo, both.hi));
-            stack.extend([(n.child as usize + 1, depth + 1), (n.child as usize, depth + 1)]);
+            stack.extend([(child + 1, depth + 1), (child, depth + 1)]);
         }
         assert_eq!(next, boxes.len());
     }
@@ -161,6 +165,6 @@ mod tests {
         let boxes: Vec<Aabb> = (0..n * n).map(cell).collect();
         let tree = build(&boxes);
         check(&tree, &boxes);
-        assert!(cost(&tree) <= cost(&sah::build(boxes.iter().copied(), &Serial)));
+        assert!(cost(&tree) <= cost(&sah::build(&boxes[..], 1, &Serial)));
     }
 }

@@ -6,8 +6,9 @@
 use std::sync::atomic::{AtomicU32, Ordering};
 
 use super::Fork;
+use super::binary::{BinaryNode, BinaryTree, Part};
 use super::layout::{Aabb, NODE_ALIGN, NODE_BYTES, WIDTH, node_ref, write_slot};
-use super::sah::{BinaryNode, BinaryTree};
+use crate::memory::zeros;
 
 /// Costs in units of a node visit; measured to be flat around these values.
 const NODE_COST: f32 = 1.0;
@@ -56,20 +57,19 @@ const FEWER: u8 = 0x80;
 impl<'a, C: Content> Plan<'a, C> {
     /// Decides.
     pub fn new(tree: &'a BinaryTree, content: &'a C, fork: &'a dyn Fork) -> Self {
-        let mut choices = vec![[0; WIDTH]; tree.nodes.len()];
-        let (root, below) = choices.split_first_mut().expect("a tree has a root");
-        Chooser { nodes: &tree.nodes, max_leaf: content.max_leaf(), fork }.costs(0, root, below);
+        let choices = Chooser { tree, max_leaf: content.max_leaf(), fork }.choices();
         let mut sizes = Vec::new();
         sizes.resize_with(tree.nodes.len(), AtomicU32::default);
         let mut plan = Plan { tree, content, fork, choices, sizes, bytes: 0, stack: 0 };
-        (plan.bytes, plan.stack) = plan.measure(Part { node: 0, first: 0 });
+        (plan.bytes, plan.stack) = plan.measure(tree.root());
         plan
     }
 
     /// Writes the tree into `out` of exactly [`Plan::bytes`] zeros, which lie at offset `at` of the arena: the root's box.
     pub fn write(&self, out: &mut [u8], at: usize) -> Aabb {
-        self.write_subtree(Part { node: 0, first: 0 }, out, at);
-        self.tree.nodes[0].aabb
+        let root = self.tree.root();
+        self.write_subtree(root, out, at);
+        self.tree.node(root).aabb
     }
 
     /// Bytes and stack entries of the subtree.
@@ -161,7 +161,7 @@ impl<'a, C: Content> Plan<'a, C> {
     }
 
     fn node(&self, part: Part) -> &BinaryNode {
-        &self.tree.nodes[part.node as usize]
+        self.tree.node(part)
     }
     fn is_inner(&self, part: Part) -> bool {
         self.choices[part.node as usize][0] == 1
@@ -170,7 +170,7 @@ impl<'a, C: Content> Plan<'a, C> {
         self.sizes[part.node as usize].load(Ordering::Relaxed) as usize * NODE_ALIGN
     }
     fn boxes(&self, part: Part) -> &[u32] {
-        &self.tree.order[part.first as usize..][..self.node(part).count as usize]
+        self.tree.boxes(part)
     }
 
     /// The roots that become the children of an 8-wide node, the largest first.
@@ -182,9 +182,16 @@ impl<'a, C: Content> Plan<'a, C> {
             // the whole tree is one leaf
             out.push(part);
         }
-        let area = |part: &Part| self.node(*part).aabb.half_area();
         // any-hit visits the last slot first: of the boxes that a ray enters, the smallest is filled best (8 % fewer nodes)
-        out.parts[..out.len].sort_by(|a, b| area(b).total_cmp(&area(a)));
+        let mut areas = [0.0; WIDTH];
+        for i in 0..out.len {
+            let part = out.parts[i];
+            let area = self.node(part).aabb.half_area();
+            let at = areas[..i].iter().take_while(|&&other| other >= area).count();
+            areas.copy_within(at..i, at + 1);
+            out.parts.copy_within(at..i, at + 1);
+            (areas[at], out.parts[at]) = (area, part);
+        }
         out
     }
     /// The best forest of at most j + 1 roots; when `all`, the node itself is not one of them.
@@ -193,27 +200,15 @@ impl<'a, C: Content> Plan<'a, C> {
         while !all && j > 0 && choice[j] & FEWER != 0 {
             j -= 1;
         }
-        if j == 0 || self.node(part).count == 1 {
+        if j == 0 || self.node(part).is_leaf() {
             out.push(part);
             return;
         }
         let to_first = (choice[j] & !FEWER) as usize;
-        let (first, second) = self.halves(part);
+        let (first, second) = self.tree.halves(part);
         self.roots(first, to_first - 1, false, out);
         self.roots(second, j - to_first, false, out);
     }
-    fn halves(&self, part: Part) -> (Part, Part) {
-        let child = self.node(part).child;
-        let count = self.tree.nodes[child as usize].count;
-        (Part { node: child, first: part.first }, Part { node: child + 1, first: part.first + count })
-    }
-}
-
-/// A binary node, and where its boxes begin in the tree's order.
-#[derive(Clone, Copy, Default)]
-struct Part {
-    node: u32,
-    first: u32,
 }
 
 /// Up to eight parts.
@@ -238,21 +233,101 @@ impl std::ops::Deref for Parts {
 }
 
 struct Chooser<'a> {
-    nodes: &'a [BinaryNode],
+    tree: &'a BinaryTree,
     max_leaf: u32,
     fork: &'a dyn Fork,
 }
 
+/// A subtree below the upper part, with the choices of its descendants.
+struct Hanging<'a> {
+    /// Its root, a node of the upper part.
+    node: u32,
+    below: &'a mut [Choice],
+    choice: Choice,
+    costs: [f32; WIDTH],
+}
+
 impl Chooser<'_> {
+    /// Of all nodes that are in the tree.
+    fn choices(&self) -> Vec<Choice> {
+        let mut choices: Vec<Choice> = zeros(self.tree.nodes.len());
+        let lower = self.tree.lower();
+        let (below, upper) = choices.split_at_mut(lower);
+        if upper.is_empty() {
+            let (root, below) = below.split_first_mut().expect("a tree has a root");
+            self.costs(0, root, below);
+            return choices;
+        }
+        let mut hanging = self.hanging(below);
+        self.all_costs(&mut hanging);
+        let mut costs = vec![None; upper.len()];
+        for h in hanging {
+            let at = h.node as usize - lower;
+            (upper[at], costs[at]) = (h.choice, Some(h.costs));
+        }
+        self.upper_costs(self.tree.root().node as usize, upper, &mut costs);
+        choices
+    }
+
+    /// The subtrees below the upper part that are no leaves, with their choices among those of the first tree.
+    fn hanging<'c>(&self, mut choices: &'c mut [Choice]) -> Vec<Hanging<'c>> {
+        let lower = self.tree.lower() as u32;
+        let mut roots: Vec<(u32, u32)> = (lower..self.tree.nodes.len() as u32)
+            .filter(|&n| !self.tree.nodes[n as usize].is_leaf())
+            .map(|n| (self.tree.child(n), n))
+            .filter(|&(child, _)| child < lower)
+            .collect();
+        roots.sort_unstable();
+        let mut at = 0;
+        let cut = |(child, node): (u32, u32)| {
+            let end = self.tree.end(node);
+            let (below, rest) = std::mem::take(&mut choices)[child as usize - at..].split_at_mut(end - child as usize);
+            (choices, at) = (rest, end);
+            Hanging { node, below, choice: Choice::default(), costs: [0.0; WIDTH] }
+        };
+        roots.into_iter().map(cut).collect()
+    }
+
+    /// Finds the costs of some subtrees, in parallel where they are large.
+    fn all_costs(&self, hanging: &mut [Hanging]) {
+        let boxes = hanging.iter().map(|h| self.tree.nodes[h.node as usize].count).sum::<u32>();
+        if hanging.len() > 1 && boxes > FORK_ABOVE {
+            let (a, b) = hanging.split_at_mut(hanging.len() / 2);
+            self.fork.join(&mut || self.all_costs(a), &mut || self.all_costs(b));
+        } else {
+            for h in hanging {
+                h.costs = self.costs(h.node as usize, &mut h.choice, h.below);
+            }
+        }
+    }
+
+    /// Least costs of a node of the upper part; those of what hangs below it are known.
+    fn upper_costs(&self, node: usize, choices: &mut [Choice], known: &mut [Option<[f32; WIDTH]>]) -> [f32; WIDTH] {
+        let (n, at) = (&self.tree.nodes[node], node - self.tree.lower());
+        if n.is_leaf() {
+            return [leaf_cost(n.aabb.half_area(), n.count); WIDTH];
+        }
+        if let Some(costs) = known[at].take() {
+            return costs;
+        }
+        let child = self.tree.child(node as u32) as usize;
+        let a = self.upper_costs(child, choices, known);
+        let b = self.upper_costs(child + 1, choices, known);
+        choose(n, self.max_leaf, &a, &b, &mut choices[at])
+    }
+
     /// Least cost of the node as a forest of at most 1..8 roots; writes its choice and those of its descendants.
     fn costs(&self, node: usize, choice: &mut Choice, below: &mut [Choice]) -> [f32; WIDTH] {
-        let n = &self.nodes[node];
-        if n.count == 1 {
-            return [leaf_cost(n.aabb.half_area(), 1); WIDTH];
+        let n = &self.tree.nodes[node];
+        if n.is_leaf() {
+            return [leaf_cost(n.aabb.half_area(), n.count); WIDTH];
         }
-        let first = n.child as usize;
+        let first = self.tree.child(node as u32) as usize;
         let (children, rest) = below.split_at_mut(2);
-        let (below_first, below_second) = rest.split_at_mut(2 * self.nodes[first].count as usize - 2);
+        let second = &self.tree.nodes[first + 1];
+        // the first child has what lies before the second's children
+        let to_first = if second.is_leaf() { rest.len() } else { second.child as usize - 1 };
+        let (below_first, below_second) = rest.split_at_mut(to_first);
         let (choice_first, choice_second) = children.split_at_mut(1);
         let (mut a, mut b) = ([0.0; WIDTH], [0.0; WIDTH]);
         let mut left = || a = self.costs(first, &mut choice_first[0], below_first);

@@ -17,6 +17,8 @@
 //! multiple of 64, then the subtrees of its inner children in slot order. So references go forward only, and every byte
 //! belongs to one record.
 
+use bytemuck::Zeroable;
+
 /// Bytes in a unit of a reference's offset.
 pub(super) const UNIT: usize = 32;
 /// Children of a node, and the largest number of primitives in a leaf.
@@ -88,7 +90,8 @@ pub(super) fn write_f32(bytes: &mut [u8], at: usize, value: f32) {
 }
 
 /// An axis-parallel box.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[repr(C)]
+#[derive(Clone, Copy, Debug, PartialEq, Zeroable)]
 pub(super) struct Aabb {
     /// Lower corner.
     pub lo: [f32; 3],
@@ -101,6 +104,7 @@ impl Aabb {
     pub const EMPTY: Aabb = Aabb { lo: [f32::INFINITY; 3], hi: [f32::NEG_INFINITY; 3] };
 
     /// Box of a triangle.
+    #[inline(always)]
     pub fn of_triangle(t: &[[f32; 3]; 3]) -> Aabb {
         t.iter().fold(Aabb::EMPTY, |b, &p| b.union(&Aabb { lo: p, hi: p }))
     }
@@ -109,6 +113,7 @@ impl Aabb {
         Aabb { lo: center.map(|c| (c - radius).next_down()), hi: center.map(|c| (c + radius).next_up()) }
     }
     /// Smallest box around both.
+    #[inline(always)]
     pub fn union(&self, other: &Aabb) -> Aabb {
         Aabb {
             lo: std::array::from_fn(|c| if other.lo[c] < self.lo[c] { other.lo[c] } else { self.lo[c] }),

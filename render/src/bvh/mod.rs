@@ -4,10 +4,12 @@
 //! [`forest::Forest`] holds the splits that are resident in one task, [`trace::Tracer`] traces rays through it.
 
 mod arena;
+mod binary;
 pub mod block;
 mod boxes;
 mod check;
 mod collapse;
+mod divide;
 #[cfg(all(target_arch = "x86_64", not(feature = "double")))]
 mod few;
 pub mod forest;
@@ -20,6 +22,7 @@ mod reinsert;
 mod sah;
 mod top;
 pub mod trace;
+mod wide;
 
 #[cfg(test)]
 mod testing;

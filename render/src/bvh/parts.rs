@@ -9,7 +9,11 @@
 //! *Rounding.* Corners of parts are computed in f64 and rounded to the next f32 outwards, within the triangle's own box. Their error
 //! in f64 is some 2^-52 of the largest coordinate, far below what [`super::trace`] allows between a ray's hit and a box.
 
-use super::layout::Aabb;
+use std::ops::Range;
+
+use super::Fork;
+use super::layout::{Aabb, MAX_COORDINATE};
+use super::sah::Boxes;
 
 /// Boxes over this many times the mean half area are cut, as long as half of that is gained. 1 visits as many records for 1 % more bytes, 8 some
 /// 3 % more.
@@ -29,31 +33,28 @@ pub(super) struct Parts<'a> {
 }
 
 impl<'a> Parts<'a> {
-    /// Of triangles of finite coordinates.
-    pub(super) fn new(triangles: &'a [[[f32; 3]; 3]]) -> Self {
-        let areas: f64 = triangles.iter().map(|t| f64::from(Aabb::of_triangle(t).half_area())).sum();
-        let mut limit = LARGE * areas / triangles.len().max(1) as f64;
+    /// Of triangles; fails with the place of the first that has a coordinate that is no number or beyond [`MAX_COORDINATE`].
+    pub(super) fn new(triangles: &'a [[[f32; 3]; 3]], fork: &dyn Fork) -> Result<Self, usize> {
+        let mut limit = LARGE * areas(triangles, fork)? / triangles.len().max(1) as f64;
         let mut parts = Parts { triangles, cut: Vec::new(), more: Vec::new() };
+        let mut large = if limit.is_finite() && limit > 0.0 { over(triangles, 0, limit, fork) } else { Vec::new() };
         // there are few triangles of twice the size: this ends soon
-        while limit.is_finite() && limit > 0.0 && !parts.fill(limit) {
+        while !parts.fill(&large, limit) {
             limit *= 2.0;
+            large.retain(|&number| half_area(&triangles[number as usize]) > limit);
         }
-        parts
+        Ok(parts)
     }
 
-    /// Cuts what is over the limit: false if that makes too many parts.
-    fn fill(&mut self, limit: f64) -> bool {
+    /// Cuts those that are over the limit: false if that makes too many parts.
+    fn fill(&mut self, large: &[u32], limit: f64) -> bool {
         self.cut.clear();
         self.more.clear();
         let mut found = Vec::new();
-        for (number, triangle) in self.triangles.iter().enumerate() {
-            let aabb = Aabb::of_triangle(triangle);
-            if f64::from(aabb.half_area()) <= limit {
-                continue;
-            }
+        for &number in large {
+            let triangle = &self.triangles[number as usize];
             let polygon = Polygon::new(triangle.iter().map(|v| v.map(f64::from)));
-            polygon.cut(aabb, limit / 2.0, MOST, &mut found);
-            let number = number as u32;
+            polygon.cut(Aabb::of_triangle(triangle), limit / 2.0, MOST, &mut found);
             let mut found = found.drain(..).map(|aabb| (number, aabb));
             self.cut.extend(found.next());
             self.more.extend(found);
@@ -64,18 +65,10 @@ impl<'a> Parts<'a> {
         true
     }
 
-    /// All boxes, by number.
-    pub(super) fn boxes(&self) -> impl Iterator<Item = Aabb> + '_ {
-        let mut cut = self.cut.iter().peekable();
-        let of_triangles = self.triangles.iter().enumerate().map(move |(number, triangle)| {
-            match cut.next_if(|(of, _)| *of as usize == number) {
-                Some((_, aabb)) => *aabb,
-                None => Aabb::of_triangle(triangle),
-            }
-        });
-        of_triangles.chain(self.more.iter().map(|(_, aabb)| *aabb))
+    /// Whether a triangle has several boxes.
+    pub(super) fn has_more(&self) -> bool {
+        !self.more.is_empty()
     }
-
     /// The triangle of a box.
     pub(super) fn triangle(&self, number: u32) -> u32 {
         match (number as usize).checked_sub(self.triangles.len()) {
@@ -83,6 +76,64 @@ impl<'a> Parts<'a> {
             Some(at) => self.more[at].0,
         }
     }
+}
+
+impl Boxes for Parts<'_> {
+    fn count(&self) -> usize {
+        self.triangles.len() + self.more.len()
+    }
+    fn of(&self, numbers: Range<usize>) -> impl Iterator<Item = Aabb> {
+        let whole = self.triangles.len();
+        let triangles = numbers.start.min(whole)..numbers.end.min(whole);
+        let more = numbers.start.max(whole) - whole..numbers.end.max(whole) - whole;
+        let mut cut =
+            self.cut[self.cut.partition_point(|(of, _)| (*of as usize) < triangles.start)..].iter().peekable();
+        let of_triangles = triangles.map(move |number| match cut.next_if(|(of, _)| *of as usize == number) {
+            Some((_, aabb)) => *aabb,
+            None => Aabb::of_triangle(&self.triangles[number]),
+        });
+        of_triangles.chain(self.more[more].iter().map(|(_, aabb)| *aabb))
+    }
+}
+
+/// Triangles that one thread looks at.
+const CHUNK: usize = 1 << 16;
+
+fn half_area(triangle: &[[f32; 3]; 3]) -> f64 {
+    f64::from(Aabb::of_triangle(triangle).half_area())
+}
+
+/// Sum of the half areas of all boxes, added up in the same way whoever does it; or the place of the first triangle that is not sound.
+fn areas(triangles: &[[[f32; 3]; 3]], fork: &dyn Fork) -> Result<f64, usize> {
+    if triangles.len() <= CHUNK {
+        let mut sum = 0.0;
+        for (at, triangle) in triangles.iter().enumerate() {
+            // a NaN would hide from the box's minima
+            if !triangle.as_flattened().iter().all(|x| x.abs() <= MAX_COORDINATE) {
+                return Err(at);
+            }
+            sum += half_area(triangle);
+        }
+        return Ok(sum);
+    }
+    let (left, right) = triangles.split_at(triangles.len() / 2);
+    let (mut a, mut b) = (Ok(0.0), Ok(0.0));
+    fork.join(&mut || a = areas(left, fork), &mut || b = areas(right, fork));
+    Ok(a? + b.map_err(|at| left.len() + at)?)
+}
+
+/// Numbers of the triangles, of which these begin with `first`, whose boxes are over the limit.
+fn over(triangles: &[[[f32; 3]; 3]], first: u32, limit: f64, fork: &dyn Fork) -> Vec<u32> {
+    if triangles.len() <= CHUNK {
+        let is_over = |t: &(u32, &[[f32; 3]; 3])| half_area(t.1) > limit;
+        return (first..).zip(triangles).filter(is_over).map(|t| t.0).collect();
+    }
+    let (left, right) = triangles.split_at(triangles.len() / 2);
+    let (mut a, mut b) = (Vec::new(), Vec::new());
+    let second = first + left.len() as u32;
+    fork.join(&mut || a = over(left, first, limit, fork), &mut || b = over(right, second, limit, fork));
+    a.append(&mut b);
+    a
 }
 
 /// What is left of a triangle between planes: convex, of at most three corners and one more for each plane.
@@ -163,6 +214,7 @@ impl Polygon {
 
 #[cfg(test)]
 mod tests {
+    use super::super::Serial;
     use super::*;
     use crate::testing::Rng;
 
@@ -182,8 +234,8 @@ mod tests {
                 triangles.fill(same);
             }
             triangles.extend((0..large).map(|_| triangle(&mut rng, 8.0)));
-            let parts = Parts::new(&triangles);
-            let boxes: Vec<Aabb> = parts.boxes().collect();
+            let parts = Parts::new(&triangles, &Serial).unwrap();
+            let boxes: Vec<Aabb> = parts.of(0..parts.count()).collect();
             assert_eq!(boxes.len(), triangles.len() + parts.more.len());
             assert_eq!(parts.more.is_empty(), large == 0, "{large}");
             assert!(parts.more.len() <= triangles.len() / SHARE);
@@ -226,7 +278,7 @@ mod tests {
             let [a, b, c, d] = [corner(-9.0, -9.0), corner(9.0, -9.0), corner(9.0, 5.0), corner(-9.0, 5.0)];
             triangles.extend([[a, b, c], [a, c, d]]);
         }
-        assert!(Parts::new(&triangles).more.is_empty());
+        assert!(Parts::new(&triangles, &Serial).unwrap().more.is_empty());
     }
 
     #[test]
@@ -235,9 +287,9 @@ mod tests {
         let needle = [[-1e6, 0.0, 0.0], [1e6, 0.0, 0.0], [1e6, 1e-6, 1e-30]];
         let huge = [[-1e12; 3], [1e12; 3], [1e12, -1e12, 1e12]];
         for triangles in [vec![], vec![flat], vec![flat, needle, huge], [vec![flat; 100], vec![huge]].concat()] {
-            let parts = Parts::new(&triangles);
-            assert!(parts.boxes().all(|b| b.is_sound()));
-            assert!(parts.boxes().count() >= triangles.len());
+            let parts = Parts::new(&triangles, &Serial).unwrap();
+            assert!(parts.of(0..parts.count()).all(|b| b.is_sound()));
+            assert!(parts.count() >= triangles.len());
         }
     }
 }

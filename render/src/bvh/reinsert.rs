@@ -12,9 +12,8 @@
 use std::cmp::Reverse;
 use std::collections::BinaryHeap;
 
-use super::collapse::leaf_cost;
+use super::binary::{BinaryTree, Part};
 use super::layout::Aabb;
-use super::sah::{BinaryNode, BinaryTree};
 
 /// Inner nodes that may change: the largest.
 const NODES: usize = 4096;
@@ -23,14 +22,14 @@ const PASSES: usize = 3;
 /// Deeper trees are not kept: what walks them is recursive, and so is the traversal's stack bound. [`super::sah`] makes none.
 const MAX_DEPTH: usize = 96;
 
-/// The same boxes in a tree of at most the same cost. Of `max_leaf` boxes that may share a leaf, those that best do stay together.
+/// The same boxes in a tree of at most the same cost. Up to `max_leaf` boxes may share a leaf; those that did in the tree still do.
 pub(super) fn improved(tree: BinaryTree, max_leaf: u32) -> BinaryTree {
-    let mut upper = Upper::of(&tree, NODES, max_leaf);
+    let mut upper = Upper::of(&tree, NODES);
     let mut moved = false;
     for _ in 0..PASSES {
         moved |= upper.reinsert_all();
     }
-    if moved { upper.with_what_is_below(&tree).unwrap_or(tree) } else { tree }
+    if moved { upper.on(tree, max_leaf) } else { tree }
 }
 
 /// The upper part of a tree. Node 0 is the root, two children are neighbours, those of the largest node come first.
@@ -57,7 +56,7 @@ const NONE: u32 = u32::MAX;
 
 impl Upper {
     /// The largest inner nodes of a tree, at most so many, and their children.
-    fn of(tree: &BinaryTree, most: usize, max_leaf: u32) -> Upper {
+    fn of(tree: &BinaryTree, most: usize) -> Upper {
         let made = |whole: u32, first: u32, parent: u32| {
             let aabb = tree.nodes[whole as usize].aabb;
             Node { aabb, area: aabb.half_area(), child: NONE, parent, whole, first }
@@ -71,10 +70,10 @@ impl Upper {
             && let Some((_, Reverse(node))) = open.pop()
         {
             let Node { whole, first, .. } = nodes[node as usize];
-            let BinaryNode { child, count, .. } = tree.nodes[whole as usize];
-            if count == 1 || (count <= max_leaf && as_leaves(tree, whole).1) {
+            if tree.nodes[whole as usize].is_leaf() {
                 continue;
             }
+            let child = tree.child(whole);
             opened += 1;
             nodes[node as usize].child = nodes.len() as u32;
             let second = first + tree.nodes[child as usize].count;
@@ -186,16 +185,14 @@ impl Upper {
         }
     }
 
-    /// The whole tree with this upper part; `None` if it is too deep.
-    fn with_what_is_below(&self, tree: &BinaryTree) -> Option<BinaryTree> {
+    /// The whole tree with this upper part in place of its own; as it was if it would be too deep.
+    fn on(&self, mut tree: BinaryTree, max_leaf: u32) -> BinaryTree {
         let mut counts = vec![0; self.nodes.len()];
-        if self.count(tree, 0, 0, &mut counts) > MAX_DEPTH {
-            return None;
+        if self.count(&tree, 0, 0, &mut counts) <= MAX_DEPTH {
+            let root = tree.add_upper(1);
+            self.write(&mut tree, &counts, (0, root), max_leaf);
         }
-        let blank = BinaryNode { aabb: Aabb::EMPTY, child: 0, count: 0 };
-        let mut out = BinaryTree { nodes: vec![blank; tree.nodes.len()], order: Vec::with_capacity(tree.order.len()) };
-        self.write(tree, &counts, 0, (0, 1), &mut out);
-        Some(out)
+        tree
     }
 
     /// Boxes below each node; the greatest depth below `n`, which is at `depth`, as far as it is at most [`MAX_DEPTH`].
@@ -214,41 +211,61 @@ impl Upper {
         first.max(second)
     }
 
-    /// Writes the subtree of `n` to the node `to`, and its descendants from `below` on.
-    fn write(&self, tree: &BinaryTree, counts: &[u32], n: u32, (to, below): (usize, usize), out: &mut BinaryTree) {
-        let (node, count) = (self.node(n), counts[n as usize]);
-        out.nodes[to] = BinaryNode { aabb: node.aabb, child: below as u32, count };
-        if node.child != NONE {
-            let second = below + 2 * counts[node.child as usize] as usize;
-            self.write(tree, counts, node.child, (below, below + 2), out);
-            self.write(tree, counts, node.child + 1, (below + 1, second), out);
-            return;
-        }
-        out.order.extend_from_slice(&tree.order[node.first as usize..][..count as usize]);
-        let from = tree.nodes[node.whole as usize].child;
-        let descendants = 2 * count as usize - 2;
-        for (to, node) in out.nodes[below..][..descendants].iter_mut().zip(tree.nodes.iter().skip(from as usize)) {
-            // a leaf's child means nothing
-            *to = BinaryNode { child: node.child.wrapping_sub(from).wrapping_add(below as u32), ..*node };
+    /// Writes the part of the subtree of `n` that is of this upper part, to the node `to`.
+    fn write(&self, tree: &mut BinaryTree, counts: &[u32], (n, to): (u32, u32), max_leaf: u32) {
+        let (Node { aabb, child, whole, first, .. }, count) = (*self.node(n), counts[n as usize]);
+        if child == NONE {
+            let is_leaf = tree.nodes[whole as usize].is_leaf();
+            let child = (!is_leaf).then(|| tree.child(whole));
+            tree.put(Part { node: to, first }, aabb, count, child);
+        } else if count <= max_leaf {
+            self.gather(tree, counts, (n, to));
+        } else {
+            let pair = tree.add_upper(2);
+            // it cannot be a leaf, so nobody asks where its boxes are
+            tree.put(Part { node: to, first: NONE }, aabb, count, Some(pair));
+            self.write(tree, counts, (child, pair), max_leaf);
+            self.write(tree, counts, (child + 1, pair + 1), max_leaf);
         }
     }
+
+    /// Writes all of the subtree of `n`, with its boxes in a row at the end of the order: they may share a leaf.
+    fn gather(&self, tree: &mut BinaryTree, counts: &[u32], (n, to): (u32, u32)) {
+        let Node { aabb, child, whole, first, .. } = *self.node(n);
+        if child == NONE {
+            copy(tree, Part { node: whole, first }, to);
+            return;
+        }
+        let (first, pair) = (tree.order.len() as u32, tree.add_upper(2));
+        self.gather(tree, counts, (child, pair));
+        self.gather(tree, counts, (child + 1, pair + 1));
+        tree.put(Part { node: to, first }, aabb, counts[n as usize], Some(pair));
+    }
+}
+
+/// Copies a subtree into the upper part, its boxes in a row at the end of the order.
+fn copy(tree: &mut BinaryTree, from: Part, to: u32) {
+    let node = *tree.node(from);
+    let first = tree.order.len();
+    let mut pair = None;
+    if node.is_leaf() {
+        tree.order.extend_from_within(from.first as usize..(from.first + node.count) as usize);
+    } else {
+        let ((a, b), child) = (tree.halves(from), tree.add_upper(2));
+        copy(tree, a, child);
+        copy(tree, b, child + 1);
+        pair = Some(child);
+    }
+    tree.put(Part { node: to, first: first as u32 }, node.aabb, node.count, pair);
 }
 
 /// Levels below a node.
 fn height(tree: &BinaryTree, node: u32) -> usize {
-    let BinaryNode { child, count, .. } = tree.nodes[node as usize];
-    if count == 1 { 0 } else { 1 + height(tree, child).max(height(tree, child + 1)) }
-}
-
-/// Least cost of the boxes below a node in leaves, and whether that is one leaf of all.
-fn as_leaves(tree: &BinaryTree, node: u32) -> (f32, bool) {
-    let BinaryNode { aabb, child, count } = tree.nodes[node as usize];
-    let together = leaf_cost(aabb.half_area(), count);
-    if count == 1 {
-        return (together, true);
+    if tree.nodes[node as usize].is_leaf() {
+        return 0;
     }
-    let apart = as_leaves(tree, child).0 + as_leaves(tree, child + 1).0;
-    if together <= apart { (together, true) } else { (apart, false) }
+    let child = tree.child(node);
+    1 + height(tree, child).max(height(tree, child + 1))
 }
 
 #[cfg(test)]
@@ -267,41 +284,57 @@ mod tests {
         (0..n).map(|i| one(i, rng)).collect()
     }
 
-    fn built(boxes: &[Aabb]) -> BinaryTree {
-        sah::build(boxes.iter().copied(), &Serial)
+    fn built(boxes: &[Aabb], max_leaf: u32) -> BinaryTree {
+        sah::build(boxes, max_leaf, &Serial)
     }
 
     /// Areas of the inner nodes.
     fn cost(tree: &BinaryTree) -> f64 {
-        tree.nodes.iter().filter(|n| n.count > 1).map(|n| f64::from(n.aabb.half_area())).sum()
+        let mut sum = 0.0;
+        let mut parts = vec![tree.root()];
+        while let Some(part) = parts.pop() {
+            let node = tree.node(part);
+            if !node.is_leaf() {
+                sum += f64::from(node.aabb.half_area());
+                parts.extend(<[Part; 2]>::from(tree.halves(part)));
+            }
+        }
+        sum
     }
 
     fn cost_of(upper: &Upper) -> f64 {
         upper.nodes.iter().filter(|n| n.child != NONE).map(|n| f64::from(n.area)).sum()
     }
 
-    fn check(tree: &BinaryTree, boxes: &[Aabb]) {
-        assert_eq!(tree.nodes.len(), 2 * boxes.len() - 1);
-        let mut order = tree.order.clone();
-        order.sort_unstable();
-        assert!(order.iter().enumerate().all(|(i, &n)| i as u32 == n), "each box once");
-        check_subtree(tree, boxes, 0, 0, 1);
+    /// Each box once, counts, bounds, and boxes that may share a leaf in a row: the boxes from left to right.
+    fn check(tree: &BinaryTree, boxes: &[Aabb], max_leaf: u32) -> Vec<u32> {
+        let found = check_part(tree, boxes, max_leaf, tree.root());
+        let mut sorted = found.clone();
+        sorted.sort_unstable();
+        assert!(sorted.len() == boxes.len() && sorted.iter().enumerate().all(|(i, &n)| i as u32 == n), "each box once");
+        found
     }
 
-    /// Places, counts, bounds.
-    fn check_subtree(tree: &BinaryTree, boxes: &[Aabb], node: usize, first: usize, below: usize) {
-        let BinaryNode { aabb, child, count } = tree.nodes[node];
-        if count == 1 {
-            assert_eq!(aabb, boxes[tree.order[first] as usize]);
-            return;
+    fn check_part(tree: &BinaryTree, boxes: &[Aabb], max_leaf: u32, part: Part) -> Vec<u32> {
+        let node = tree.node(part);
+        let mut found = Vec::new();
+        if node.is_leaf() {
+            assert!(node.count <= max_leaf);
+            found.extend(tree.boxes(part));
+            let own = found.iter().fold(Aabb::EMPTY, |sum, &n| sum.union(&boxes[n as usize]));
+            assert_eq!(node.aabb, own);
+        } else {
+            let (a, b) = tree.halves(part);
+            assert_eq!(tree.node(a).count + tree.node(b).count, node.count);
+            assert_eq!(node.aabb, tree.node(a).aabb.union(&tree.node(b).aabb));
+            found = check_part(tree, boxes, max_leaf, a);
+            found.extend(check_part(tree, boxes, max_leaf, b));
         }
-        assert_eq!(child as usize, below);
-        let (a, b) = (tree.nodes[below], tree.nodes[below + 1]);
-        assert_eq!(a.count + b.count, count);
-        assert_eq!(aabb, a.aabb.union(&b.aabb));
-        let second = below + 2 * a.count as usize;
-        check_subtree(tree, boxes, below, first, below + 2);
-        check_subtree(tree, boxes, below + 1, first + a.count as usize, second);
+        assert_eq!(found.len(), node.count as usize);
+        if node.count <= max_leaf {
+            assert_eq!(found, tree.boxes(part));
+        }
+        found
     }
 
     #[test]
@@ -310,23 +343,23 @@ mod tests {
         for n in [1, 2, 3, 4, 5, 10, 100, 3000, 20_000] {
             let boxes = boxes(&mut rng, n);
             for max_leaf in [1, 8] {
-                let tree = improved(built(&boxes), max_leaf);
-                check(&tree, &boxes);
+                let tree = improved(built(&boxes, max_leaf), max_leaf);
+                let found = check(&tree, &boxes, max_leaf);
                 // of sums of as many areas, each rounded
-                assert!(cost(&tree) <= cost(&built(&boxes)) * (1.0 + 1e-6));
-                assert!(n < 100 || cost(&tree) < 0.97 * cost(&built(&boxes)), "{n}");
-                assert_eq!(improved(built(&boxes), max_leaf).order, tree.order);
+                assert!(cost(&tree) <= cost(&built(&boxes, max_leaf)) * (1.0 + 1e-6));
+                assert!(n < 100 || cost(&tree) < 0.97 * cost(&built(&boxes, max_leaf)), "{n}");
+                assert_eq!(check(&improved(built(&boxes, max_leaf), max_leaf), &boxes, max_leaf), found);
             }
         }
         // boxes all alike, and a flat grid, have nothing to gain
         let alike = vec![Aabb { lo: [0.0; 3], hi: [1.0, 0.0, 2.0] }; 200];
-        assert_eq!(improved(built(&alike), 8).order, built(&alike).order);
+        assert_eq!(improved(built(&alike, 8), 8).order, built(&alike, 8).order);
         let cell = |i: usize| {
             let (x, y) = ((i % 64) as f32, (i / 64) as f32);
             Aabb { lo: [x, y, 0.0], hi: [x + 1.0, y + 1.0, 0.0] }
         };
         let grid: Vec<Aabb> = (0..64 * 64).map(cell).collect();
-        check(&improved(built(&grid), 8), &grid);
+        check(&improved(built(&grid, 8), 8), &grid, 8);
     }
 
     /// Against every place tried in turn.
@@ -336,7 +369,7 @@ mod tests {
         let (mut found, mut none) = (0, 0);
         for _ in 0..30 {
             let boxes = boxes(&mut rng, 12);
-            let upper = Upper::of(&built(&boxes), 100, 1);
+            let upper = Upper::of(&built(&boxes, 1), 100);
             let before = cost_of(&upper);
             for n in 1..upper.nodes.len() as u32 {
                 let above = |mut of: u32, sought: u32| {
@@ -369,8 +402,9 @@ mod tests {
         let mut boxes = boxes(&mut rng, 500);
         let wall = Aabb { lo: [-12.0, -12.0, 12.0], hi: [12.0; 3] };
         boxes.extend([wall; 2]);
-        let tree = improved(built(&boxes), 8);
-        let at = |n: u32| tree.order.iter().position(|&k| k == n).expect("each is there");
+        let tree = improved(built(&boxes, 8), 8);
+        let order = check(&tree, &boxes, 8);
+        let at = |n: u32| order.iter().position(|&k| k == n).expect("each is there");
         assert_eq!(at(500).abs_diff(at(501)), 1);
     }
 
@@ -383,11 +417,11 @@ mod tests {
                 Aabb { lo: [-size; 3], hi: [size; 3] }
             })
             .collect();
-        let mut upper = Upper::of(&built(&boxes), NODES, 1);
+        let mut upper = Upper::of(&built(&boxes, 1), NODES);
         for _ in 0..20 {
             upper.reinsert_all();
         }
-        assert!(upper.with_what_is_below(&built(&boxes)).is_none());
-        check(&improved(built(&boxes), 1), &boxes);
+        assert_eq!(upper.on(built(&boxes, 1), 1).root().node, 0);
+        check(&improved(built(&boxes, 1), 1), &boxes, 1);
     }
 }

@@ -1,256 +1,340 @@
-//! A binary tree over boxes: top-down, binned surface area heuristic, one box in each leaf.
+//! A binary tree over boxes: top-down, binned surface area heuristic, boxes that are best in one leaf left together.
 //!
 //! Wald, "On fast Construction of SAH-based Bounding Volume Hierarchies" (2007). The place of every node follows from
 //! the sizes of the subtrees before it, and bounds are minima and maxima, so the tree is the same however the work was
-//! divided. Of equal costs, as regular grids have many, the more even split wins.
+//! divided. Of equal costs, as regular grids have many, the more even division wins.
 
-use glam::Vec4;
+use super::binary::{BinaryNode, BinaryTree};
+use super::collapse::leaf_cost;
+use super::divide::{Halves, Item, Range, divide, halve};
+use super::layout::{Aabb, WIDTH};
+use super::{Fork, wide};
+use crate::memory::zeros;
 
-use super::Fork;
-use super::layout::Aabb;
-
-/// A binary tree. Node 0 is the root; the descendants of a node with n boxes are 2 n - 2 nodes in a row: its two
-/// children, those below the first, those below the second.
-pub(super) struct BinaryTree {
-    /// `2 n - 1` nodes for n boxes.
-    pub nodes: Vec<BinaryNode>,
-    /// Numbers of the boxes; those below a node are a range of it.
-    pub order: Vec<u32>,
+/// What a tree is built over: 1 to 2^31 boxes, not inverted, with finite coordinates whose areas are finite.
+pub(super) trait Boxes: Sync {
+    /// How many.
+    fn count(&self) -> usize;
+    /// Those of some numbers, in order.
+    fn of(&self, numbers: std::ops::Range<usize>) -> impl Iterator<Item = Aabb>;
 }
 
-/// A node of a [`BinaryTree`].
-#[derive(Clone, Copy)]
-pub(super) struct BinaryNode {
-    /// Bounds of the boxes below.
-    pub aabb: Aabb,
-    /// Index of the first child, the second follows; meaningless in a leaf.
-    pub child: u32,
-    /// Number of boxes below; a leaf has 1.
-    pub count: u32,
+impl Boxes for [Aabb] {
+    fn count(&self) -> usize {
+        self.len()
+    }
+    fn of(&self, numbers: std::ops::Range<usize>) -> impl Iterator<Item = Aabb> {
+        self[numbers].iter().copied()
+    }
 }
 
 /// Below this many boxes a subtree is built by one thread.
 const FORK_ABOVE: usize = 1 << 14;
 /// From this depth on, ranges are halved: bounds the recursion and the traversal stack.
 const MAX_SAH_DEPTH: usize = 64;
+/// No node lies deeper: 2^31 boxes can be halved 31 times.
+const MAX_DEPTH: usize = MAX_SAH_DEPTH + 31;
 
-/// Builds the tree. Needs 1 to 2^31 boxes, not inverted, with finite coordinates whose areas are finite.
-pub(super) fn build(boxes: impl Iterator<Item = Aabb>, fork: &dyn Fork) -> BinaryTree {
-    let mut items: Vec<Item> = boxes.enumerate().map(|(i, b)| Item::new(&b, i as u32)).collect();
-    assert!(!items.is_empty() && items.len() <= 1 << 31, "1 to 2^31 boxes");
-    let blank = BinaryNode { aabb: Aabb::EMPTY, child: 0, count: 0 };
-    let mut nodes = vec![blank; 2 * items.len() - 1];
-    let (root, below) = nodes.split_first_mut().expect("at least one node");
-    let range = items.iter().fold(Range::EMPTY, |r, i| r.with(i));
-    Builder { fork }.subtree(&mut items, range, root, below, 1, 0);
-    BinaryTree { order: items.iter().map(Item::number).collect(), nodes }
+/// Builds the tree. Up to `max_leaf` boxes, 1 to [`WIDTH`], are one leaf where that is expected to cost no more than any way to divide them.
+pub(super) fn build<B: Boxes + ?Sized>(boxes: &B, max_leaf: u32, fork: &dyn Fork) -> BinaryTree {
+    let count = boxes.count();
+    assert!((1..=1 << 31).contains(&count), "1 to 2^31 boxes");
+    let mut items: Vec<Item> = zeros(count);
+    let range = fill(&mut items, boxes, 0, fork);
+    let below = descend(&mut items, range, 0, max_leaf as usize, fork);
+    let mut nodes: Vec<BinaryNode> = zeros(1 + below.len());
+    nodes[0] = BinaryNode { aabb: range.aabb(), child: u32::from(below.len() > 0), count: count as u32 };
+    below.write(&mut nodes[1..], fork);
+    let mut order = zeros(count);
+    numbers(&items, &mut order, fork);
+    BinaryTree::new(nodes, order)
 }
 
-/// A box on its way through the partitions.
-#[derive(Clone, Copy)]
-struct Item {
-    /// Lower corner; `w` holds the low 16 bits of the number as a small float, so that vector arithmetic on all four
-    /// lanes meets no denormals and no NaN.
-    lo: Vec4,
-    /// Upper corner; `w` holds the high 16 bits of the number.
-    hi: Vec4,
-}
-
-impl Item {
-    fn new(b: &Aabb, number: u32) -> Item {
-        // adding 0 turns -0 into 0: minima and maxima of zeros of either sign differ from one processor to the next
-        let v = |p: [f32; 3], w: u32| Vec4::new(p[0] + 0.0, p[1] + 0.0, p[2] + 0.0, w as f32);
-        Item { lo: v(b.lo, number & 0xffff), hi: v(b.hi, number >> 16) }
+/// Writes the numbers of some boxes.
+fn numbers(items: &[Item], out: &mut [u32], fork: &dyn Fork) {
+    if items.len() <= FORK_ABOVE {
+        return out.iter_mut().zip(items).for_each(|(to, item)| *to = item.number());
     }
-    fn number(&self) -> u32 {
-        self.lo.w as u32 | (self.hi.w as u32) << 16
-    }
-    /// Twice the centre.
-    #[inline(always)]
-    fn center(&self) -> Vec4 {
-        self.lo + self.hi
-    }
+    let (left, right) = items.split_at(items.len() / 2);
+    let (a, b) = out.split_at_mut(left.len());
+    fork.join(&mut || numbers(left, a, fork), &mut || numbers(right, b, fork));
 }
 
-/// Bounds of some boxes and of their (doubled) centres.
-#[derive(Clone, Copy)]
-struct Range {
-    lo: Vec4,
-    hi: Vec4,
-    center_lo: Vec4,
-    center_hi: Vec4,
+/// Writes the boxes from number `first` on: their bounds.
+fn fill<B: Boxes + ?Sized>(items: &mut [Item], boxes: &B, first: usize, fork: &dyn Fork) -> Range {
+    if items.len() <= FORK_ABOVE {
+        let mut range = Range::EMPTY;
+        let numbers = first..first + items.len();
+        for ((item, number), aabb) in items.iter_mut().zip(numbers.clone()).zip(boxes.of(numbers)) {
+            *item = Item::new(&aabb, number as u32);
+            range = range.with(item);
+        }
+        return range;
+    }
+    let half = items.len() / 2;
+    let (left, right) = items.split_at_mut(half);
+    let (mut a, mut b) = (Range::EMPTY, Range::EMPTY);
+    fork.join(&mut || a = fill(left, boxes, first, fork), &mut || b = fill(right, boxes, first + half, fork));
+    a.and(&b)
 }
 
-impl Range {
-    const EMPTY: Range =
-        Range { lo: Vec4::INFINITY, hi: Vec4::NEG_INFINITY, center_lo: Vec4::INFINITY, center_hi: Vec4::NEG_INFINITY };
+/// What is below a node, before it is known where all of it is to be.
+enum Below {
+    /// Of few boxes: as it will be; nothing below a leaf.
+    Nodes(Vec<BinaryNode>),
+    /// The children, and what is below them.
+    Halves(Box<([BinaryNode; 2], [Below; 2])>),
+}
 
-    #[inline(always)]
-    fn with(self, item: &Item) -> Range {
-        let c = item.center();
-        Range {
-            lo: self.lo.min(item.lo),
-            hi: self.hi.max(item.hi),
-            center_lo: self.center_lo.min(c),
-            center_hi: self.center_hi.max(c),
+impl Below {
+    /// How many nodes.
+    fn len(&self) -> usize {
+        match self {
+            Below::Nodes(nodes) => nodes.len(),
+            Below::Halves(halves) => 2 + halves.1.iter().map(Below::len).sum::<usize>(),
         }
     }
-    fn aabb(&self) -> Aabb {
-        Aabb { lo: self.lo.truncate().to_array(), hi: self.hi.truncate().to_array() }
+
+    /// Moves them to where they are to be.
+    fn write(self, out: &mut [BinaryNode], fork: &dyn Fork) {
+        match self {
+            Below::Nodes(nodes) => out.copy_from_slice(&nodes),
+            Below::Halves(halves) => {
+                let (mut pair, [first, second]) = *halves;
+                let (children, rest) = out.split_at_mut(2);
+                let (below_first, below_second) = rest.split_at_mut(first.len());
+                let far = |below: &[BinaryNode], distance: usize| if below.is_empty() { 0 } else { distance as u32 };
+                pair[0].child = far(below_first, 2);
+                pair[1].child = far(below_second, 1 + below_first.len());
+                children.copy_from_slice(&pair);
+                let (mut first, mut second) = (Some(first), Some(second));
+                fork.join(
+                    &mut || first.take().into_iter().for_each(|below| below.write(below_first, fork)),
+                    &mut || second.take().into_iter().for_each(|below| below.write(below_second, fork)),
+                );
+            }
+        }
     }
 }
 
-struct Builder<'a> {
-    fork: &'a dyn Fork,
+/// Builds what is below a node of these items, in parallel.
+fn descend(items: &mut [Item], range: Range, depth: usize, max_leaf: usize, fork: &dyn Fork) -> Below {
+    if items.len() <= FORK_ABOVE || depth >= MAX_SAH_DEPTH {
+        let mut subtree = Subtree { nodes: Vec::with_capacity(items.len()), items, range, depth, max_leaf };
+        wide::subtree(&mut subtree, &());
+        return Below::Nodes(subtree.nodes);
+    }
+    let mut division = Division { items, range, halves: (0, Range::EMPTY, Range::EMPTY) };
+    wide::divide(&mut division, &());
+    let (at, left_range, right_range) = division.halves;
+    let (left, right) = items.split_at_mut(at);
+    let pair = [node(&left_range, left.len()), node(&right_range, right.len())];
+    let mut below = [Below::Nodes(Vec::new()), Below::Nodes(Vec::new())];
+    let [a, b] = &mut below;
+    fork.join(&mut || *a = descend(left, left_range, depth + 1, max_leaf, fork), &mut || {
+        *b = descend(right, right_range, depth + 1, max_leaf, fork)
+    });
+    Below::Halves(Box::new((pair, below)))
 }
 
-impl Builder<'_> {
-    /// Builds the subtree of `me` over `items`; its descendants go to `below`, whose first has the index `base`.
-    fn subtree(
-        &self,
-        items: &mut [Item],
-        range: Range,
-        me: &mut BinaryNode,
-        below: &mut [BinaryNode],
-        base: u32,
-        depth: usize,
-    ) {
-        *me = BinaryNode { aabb: range.aabb(), child: base, count: items.len() as u32 };
-        if items.len() == 1 {
-            return;
+/// A node, a leaf so far.
+#[inline(always)]
+fn node(range: &Range, count: usize) -> BinaryNode {
+    BinaryNode { aabb: range.aabb(), child: 0, count: count as u32 }
+}
+
+/// Boxes to be divided, and then their halves.
+pub(super) struct Division<'a> {
+    items: &'a mut [Item],
+    range: Range,
+    halves: Halves,
+}
+
+impl Division<'_> {
+    #[inline(always)]
+    pub(super) fn run(&mut self, _: &()) {
+        self.halves = divide(self.items, &self.range);
+    }
+}
+
+/// Boxes, and then the nodes below that of all of them.
+pub(super) struct Subtree<'a> {
+    items: &'a mut [Item],
+    range: Range,
+    nodes: Vec<BinaryNode>,
+    /// Of the node of all.
+    depth: usize,
+    max_leaf: usize,
+}
+
+/// A node whose descendants are to be built.
+#[derive(Clone, Copy)]
+struct Pending {
+    range: Range,
+    first: usize,
+    count: usize,
+    /// Where it is among the nodes.
+    at: usize,
+    depth: usize,
+}
+
+/// `at` of the node of all boxes, which is not among them.
+const ROOT: usize = usize::MAX;
+
+impl Subtree<'_> {
+    #[inline(always)]
+    pub(super) fn run(&mut self, _: &()) {
+        let count = self.items.len();
+        let mut pending = Pending { range: self.range, first: 0, count, at: ROOT, depth: self.depth };
+        // what is to the right of the way from the root to where it is
+        let mut stack = [pending; MAX_DEPTH];
+        let mut waiting = 0;
+        loop {
+            if pending.count <= self.max_leaf {
+                self.few(pending);
+            } else {
+                let Pending { range, first, count, at: parent, depth } = pending;
+                let items = &mut self.items[first..first + count];
+                let (at, left, right) = if depth >= MAX_SAH_DEPTH { halve(items) } else { divide(items, &range) };
+                let pair = self.push(parent, [node(&left, at), node(&right, count - at)]);
+                let depth = depth + 1;
+                stack[waiting] = Pending { range: right, first: first + at, count: count - at, at: pair + 1, depth };
+                waiting += usize::from(count - at > 1);
+                if at > 1 {
+                    pending = Pending { range: left, first, count: at, at: pair, depth };
+                    continue;
+                }
+            }
+            if waiting == 0 {
+                return;
+            }
+            waiting -= 1;
+            pending = stack[waiting];
         }
-        let (at, left_range, right_range) = match items.len() {
-            2 => halve(items),
-            _ if depth >= MAX_SAH_DEPTH => halve(items),
-            // few boxes do not fill many bins
-            3..=6 => split::<4>(items, &range),
-            7..=40 => split::<8>(items, &range),
-            _ => split::<16>(items, &range),
+    }
+
+    /// Appends the children of a node: where they are.
+    #[inline(always)]
+    fn push(&mut self, parent: usize, pair: [BinaryNode; 2]) -> usize {
+        let at = self.nodes.len();
+        if parent != ROOT {
+            self.nodes[parent].child = (at - parent) as u32;
+        }
+        self.nodes.extend(pair);
+        at
+    }
+
+    /// Builds what is below a node of so few boxes that they may share a leaf, if they are not to.
+    #[inline(always)]
+    fn few(&mut self, top: Pending) {
+        const MOST: usize = 2 * WIDTH - 1;
+        // all the way down first, children after their parents
+        let mut all = [top; MOST];
+        let mut children = [0; MOST];
+        let (mut len, mut i) = (1, 0);
+        while i < len {
+            let Pending { range, first, count, depth, .. } = all[i];
+            if count > 1 {
+                let items = &mut self.items[first..first + count];
+                let (at, left, right) = if depth >= MAX_SAH_DEPTH { halve(items) } else { divide(items, &range) };
+                let depth = depth + 1;
+                all[len] = Pending { range: left, first, count: at, at: 0, depth };
+                all[len + 1] = Pending { range: right, first: first + at, count: count - at, at: 0, depth };
+                children[i] = len;
+                len += 2;
+            }
+            i += 1;
+        }
+        // then from below: what is cheaper as one leaf
+        let mut costs = [0.0; MOST];
+        for i in (0..len).rev() {
+            costs[i] = leaf_cost(all[i].range.aabb().half_area(), all[i].count as u32);
+            let child = children[i];
+            if child > 0 {
+                let apart = costs[child] + costs[child + 1];
+                if costs[i] <= apart { children[i] = 0 } else { costs[i] = apart }
+            }
+        }
+        let mut stack = [(0, top.at); WIDTH];
+        let mut waiting = 1;
+        while waiting > 0 {
+            waiting -= 1;
+            let (i, at) = stack[waiting];
+            let child = children[i];
+            if child > 0 {
+                let [a, b] = [&all[child], &all[child + 1]];
+                let pair = self.push(at, [node(&a.range, a.count), node(&b.range, b.count)]);
+                stack[waiting] = (child + 1, pair + 1);
+                stack[waiting + 1] = (child, pair);
+                waiting += 2;
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::Serial;
+    use super::*;
+    use crate::testing::Rng;
+
+    fn boxes(n: usize) -> Vec<Aabb> {
+        let mut rng = Rng(1);
+        let one = |_| {
+            let (p, size) = (rng.vec3(10.0), rng.vec3(0.3).abs());
+            Aabb { lo: (p - size).to_array(), hi: (p + size).to_array() }
         };
-        let many = items.len() > FORK_ABOVE;
-        let (left, right) = items.split_at_mut(at);
-        let (children, rest) = below.split_at_mut(2);
-        let (below_left, below_right) = rest.split_at_mut(2 * at - 2);
-        let (first, second) = children.split_at_mut(1);
-        let (first, second) = (&mut first[0], &mut second[0]);
-        let right_base = base + 2 * at as u32;
-        let mut a = || self.subtree(left, left_range, first, below_left, base + 2, depth + 1);
-        let mut b = || self.subtree(right, right_range, second, below_right, right_base, depth + 1);
-        if many {
-            self.fork.join(&mut a, &mut b);
-        } else {
-            a();
-            b();
+        (0..n).map(one).collect()
+    }
+
+    fn bits(nodes: &[BinaryNode]) -> Vec<[u32; 8]> {
+        let of = |n: &BinaryNode| {
+            let [a, b, c] = n.aabb.lo.map(f32::to_bits);
+            let [d, e, f] = n.aabb.hi.map(f32::to_bits);
+            [a, b, c, d, e, f, n.child, n.count]
+        };
+        nodes.iter().map(of).collect()
+    }
+
+    #[test]
+    fn vectors_make_the_same_tree() {
+        for max_leaf in [1, WIDTH] {
+            for n in [1, 2, 8, 9, 300, 5000] {
+                let mut items = vec![Item::new(&Aabb::EMPTY, 0); n];
+                let range = fill(&mut items, &boxes(n)[..], 0, &Serial);
+                let mut others = items.clone();
+                let subtree = |items| Subtree { items, range, nodes: Vec::new(), depth: 0, max_leaf };
+                let mut plain = subtree(&mut items);
+                plain.run(&());
+                let mut wide = subtree(&mut others);
+                wide::subtree(&mut wide, &());
+                assert_eq!(bits(&plain.nodes), bits(&wide.nodes));
+                assert!(items.iter().map(Item::number).eq(others.iter().map(Item::number)));
+            }
         }
     }
-}
 
-/// The first half and the second, as they stand.
-fn halve(items: &[Item]) -> (usize, Range, Range) {
-    let at = items.len() / 2;
-    let bounds = |part: &[Item]| part.iter().fold(Range::EMPTY, |r, i| r.with(i));
-    (at, bounds(&items[..at]), bounds(&items[at..]))
-}
-
-/// What lies in a bin.
-#[derive(Clone, Copy)]
-struct Bin {
-    lo: Vec4,
-    hi: Vec4,
-    count: u32,
-}
-
-impl Bin {
-    const EMPTY: Bin = Bin { lo: Vec4::INFINITY, hi: Vec4::NEG_INFINITY, count: 0 };
-
-    #[inline(always)]
-    fn and(self, other: &Bin) -> Bin {
-        Bin { lo: self.lo.min(other.lo), hi: self.hi.max(other.hi), count: self.count + other.count }
-    }
-    /// Half the surface area times the number of boxes.
-    fn cost(&self) -> f32 {
-        let d = self.hi - self.lo;
-        (d.x * d.y + d.y * d.z + d.z * d.x) * self.count as f32
-    }
-}
-
-/// From a doubled centre to its bin on each axis.
-struct Bins<const B: usize> {
-    start: Vec4,
-    scale: Vec4,
-}
-
-impl<const B: usize> Bins<B> {
-    fn new(range: &Range) -> Self {
-        let extent = range.center_hi - range.center_lo;
-        // an axis without extent, or with one too small to divide by, has one bin
-        let scale = extent.to_array().map(|x| if x > f32::MIN_POSITIVE * B as f32 { B as f32 / x } else { 0.0 });
-        Bins { start: range.center_lo, scale: Vec4::from_array(scale) }
-    }
-    /// A float of 2^23 + k has k in its low bits, rounded to nearest; half a bin less rounds down.
-    #[inline(always)]
-    fn of(&self, item: &Item) -> [u32; 4] {
-        let position = (item.center() - self.start) * self.scale - 0.5;
-        let clamped = position.max(Vec4::ZERO).min(Vec4::splat(B as f32 - 1.0));
-        (clamped + 8_388_608.0).to_array().map(|x| x.to_bits() & (B as u32 - 1))
-    }
-}
-
-/// Splits at the cheapest of B - 1 planes on each axis and partitions: size of the left part, both parts' bounds.
-fn split<const B: usize>(items: &mut [Item], range: &Range) -> (usize, Range, Range) {
-    const { assert!(B.is_power_of_two() && B <= 1 << 16) };
-    let bins = Bins::<B>::new(range);
-    let mut filled = [[Bin::EMPTY; B]; 3];
-    for item in items.iter() {
-        let k = bins.of(item);
-        for axis in 0..3 {
-            let bin = &mut filled[axis][k[axis] as usize];
-            *bin = Bin { lo: bin.lo.min(item.lo), hi: bin.hi.max(item.hi), count: bin.count + 1 };
-        }
-    }
-    let mut best: Option<(f32, usize, usize)> = None;
-    for axis in 0..3 {
-        let mut right = [(0.0, 0u32); B];
-        let mut sum = Bin::EMPTY;
-        for i in (1..B).rev() {
-            sum = sum.and(&filled[axis][i]);
-            right[i] = (if sum.count > 0 { sum.cost() } else { 0.0 }, sum.count);
-        }
-        let mut sum = Bin::EMPTY;
-        for i in 1..B {
-            sum = sum.and(&filled[axis][i - 1]);
-            if sum.count == 0 || right[i].1 == 0 {
+    /// Parts that are built apart lie as they would if one had built all of it: what is below a node is one row.
+    #[test]
+    fn what_is_below_a_node_lies_in_a_row() {
+        let boxes = boxes(3 * FORK_ABOVE);
+        let tree = build(&boxes[..], WIDTH as u32, &Serial);
+        let mut next = 1;
+        let mut parts = vec![tree.root()];
+        let mut found = vec![false; boxes.len()];
+        while let Some(part) = parts.pop() {
+            let node = tree.node(part);
+            if node.is_leaf() {
+                tree.boxes(part).iter().for_each(|&n| found[n as usize] = true);
+                assert!(node.count as usize <= WIDTH);
                 continue;
             }
-            // a millionth of the cost decides between equals and is below what the estimate is worth
-            let uneven = sum.count.abs_diff(right[i].1) as f32 / items.len() as f32;
-            let cost = (sum.cost() + right[i].0) * (1.0 + uneven * 1e-6);
-            if best.is_none_or(|(least, _, _)| cost < least) {
-                best = Some((cost, axis, i));
-            }
+            let (a, b) = tree.halves(part);
+            assert_eq!((a.node, b.node), (next, next + 1));
+            next += 2;
+            parts.extend([b, a]);
         }
+        assert_eq!(next as usize, tree.nodes.len());
+        assert!(found.iter().all(|&f| f));
     }
-    match best {
-        // all centres in one bin
-        None => halve(items),
-        Some((_, axis, plane)) => partition(items, |item| bins.of(item)[axis] < plane as u32),
-    }
-}
-
-/// Moves the items of the left side to the front: their number, and both sides' bounds.
-#[inline(always)]
-fn partition(items: &mut [Item], is_left: impl Fn(&Item) -> bool) -> (usize, Range, Range) {
-    let (mut left, mut right) = (Range::EMPTY, Range::EMPTY);
-    let (mut i, mut j) = (0, items.len());
-    while i < j {
-        if is_left(&items[i]) {
-            left = left.with(&items[i]);
-            i += 1;
-        } else {
-            j -= 1;
-            items.swap(i, j);
-            right = right.with(&items[j]);
-        }
-    }
-    (i, left, right)
 }
