@@ -216,6 +216,8 @@ def merge(path: Path, rows: list, key: str) -> list:
 
 
 def plot(rows: list, path: Path) -> None:
+    from matplotlib import ticker
+
     names = list(dict.fromkeys(r["scene"] for r in rows))
     drawn, axes = figure(2, len(names), (4.5 * len(names), 8))
     for column, scene in enumerate(names):
@@ -229,7 +231,11 @@ def plot(rows: list, path: Path) -> None:
                     ax.loglog([t for t, _ in curve], [e for _, e in curve], "o-", color=f"C{number}", label=renderer)
             ax.axhline(TARGETS.get(scene, TARGET), color="grey", linestyle=":")
             ax.set(title=scene, xlabel=label, ylabel="relMSE")
-            ax.grid(True, which="both", alpha=0.3)
+            ax.grid(True, alpha=0.3)
+            for axis in (ax.xaxis, ax.yaxis):
+                axis.set_major_locator(ticker.LogLocator(subs=(1, 2, 5)))
+                axis.set_major_formatter("{x:g}")
+                axis.set_minor_locator(ticker.NullLocator())
             ax.legend()
     save(drawn, path)
 
