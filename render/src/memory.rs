@@ -30,8 +30,10 @@ pub(crate) fn spacious<T>(count: usize) -> Vec<T> {
     values
 }
 
-/// So many zeros, in huge pages if they are many and the system has them; as fresh memory is zero, none is written.
+/// So many zeros, in huge pages if they are many and the system has them; as fresh memory is zero, none is written. Of values that are aligned to more
+/// than 16 bytes the standard library would write all, into small pages.
 pub(crate) fn zeros<T: bytemuck::Zeroable>(count: usize) -> Vec<T> {
+    const { assert!(align_of::<T>() <= 16) };
     let mut values: Vec<T> = bytemuck::zeroed_vec(count);
     let room = std::ptr::slice_from_raw_parts_mut(values.as_mut_ptr().cast(), count);
     // SAFETY: the vector's own values, borrowed mutably; `widen` writes nothing.

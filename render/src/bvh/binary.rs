@@ -1,6 +1,6 @@
 //! A binary tree over boxes, as it lies in memory while a block is built.
 
-use bytemuck::Zeroable;
+use bytemuck::{Pod, Zeroable};
 
 use super::layout::Aabb;
 
@@ -18,9 +18,9 @@ pub(super) struct BinaryTree {
     upper: Vec<u32>,
 }
 
-/// A node of a [`BinaryTree`].
-#[repr(C)]
-#[derive(Clone, Copy, Zeroable)]
+/// A node of a [`BinaryTree`]. As large and aligned as an item ([`super::divide`]), in whose place it comes.
+#[repr(C, align(16))]
+#[derive(Clone, Copy, Pod, Zeroable)]
 pub(super) struct BinaryNode {
     /// Bounds of the boxes below.
     pub aabb: Aabb,

@@ -12,34 +12,47 @@ const ALL_WAYS: usize = 5;
 
 /// A lower corner and a negated upper one; what their last lanes hold does not matter.
 #[derive(Clone, Copy)]
-struct Lanes {
+pub(super) struct Bounds {
     lo: Vec4,
     negated: Vec4,
 }
 
-impl Lanes {
+impl Bounds {
     /// Of nothing.
-    const EMPTY: Lanes = Lanes { lo: Vec4::INFINITY, negated: Vec4::INFINITY };
+    pub const EMPTY: Bounds = Bounds { lo: Vec4::INFINITY, negated: Vec4::INFINITY };
 
     #[inline(always)]
-    fn min(self, other: Lanes) -> Lanes {
-        Lanes { lo: self.lo.min(other.lo), negated: self.negated.min(other.negated) }
+    pub fn min(self, other: Bounds) -> Bounds {
+        Bounds { lo: self.lo.min(other.lo), negated: self.negated.min(other.negated) }
+    }
+    /// Of some boxes.
+    #[inline(always)]
+    fn of(items: &[Item]) -> Bounds {
+        items.iter().fold(Bounds::EMPTY, |sum, item| sum.min(item.bounds()))
     }
     #[inline(always)]
-    fn plus(self, x: f32) -> Lanes {
-        Lanes { lo: self.lo + x, negated: self.negated + x }
+    pub fn aabb(&self) -> Aabb {
+        Aabb { lo: self.lo.truncate().to_array(), hi: (-self.negated).truncate().to_array() }
+    }
+    #[inline(always)]
+    fn negated_extent(&self) -> Vec4 {
+        self.lo + self.negated
     }
     /// Half the surface area of the box.
     #[inline(always)]
-    fn half_area(&self) -> f32 {
-        // the negated extent: products of two
-        let d = self.lo + self.negated;
-        d.x * d.y + d.y * d.z + d.z * d.x
+    pub fn half_area(&self) -> f32 {
+        half_area(self.negated_extent().to_array())
     }
 }
 
+/// Of a box with this extent or, as it is made of products of two, this negated one.
+#[inline(always)]
+fn half_area([x, y, z, _]: [f32; 4]) -> f32 {
+    x * y + y * z + z * x
+}
+
 /// A box and its number.
-#[repr(C, align(32))]
+#[repr(C, align(16))]
 #[derive(Clone, Copy, Pod, Zeroable)]
 pub(super) struct Item {
     /// Lower corner; then the low 16 bits of the number as a small float, so that vector arithmetic on all lanes meets no denormals and no NaN.
@@ -49,77 +62,47 @@ pub(super) struct Item {
 }
 
 impl Item {
+    #[inline(always)]
     pub fn new(b: &Aabb, number: u32) -> Item {
         // adding 0 turns -0 into 0: minima and maxima of zeros of either sign differ from one processor to the next. So all zeros of lower corners are
         // 0 and all of negated upper ones -0
-        let [lo, hi] = [b.lo, b.hi].map(|p| p.map(|x| x + 0.0));
-        let [low, high] = [number & 0xffff, number >> 16].map(|half| half as f32);
-        Item { lo: [lo[0], lo[1], lo[2], low], negated: [-hi[0], -hi[1], -hi[2], high] }
+        let (lo, hi) = (b.lo, b.hi);
+        let (low, high) = ((number & 0xffff) as f32, (number >> 16) as f32);
+        Item {
+            lo: [lo[0] + 0.0, lo[1] + 0.0, lo[2] + 0.0, low],
+            negated: [-(hi[0] + 0.0), -(hi[1] + 0.0), -(hi[2] + 0.0), high],
+        }
     }
     pub fn number(&self) -> u32 {
         self.lo[3] as u32 | (self.negated[3] as u32) << 16
     }
     #[inline(always)]
-    fn bounds(&self) -> Lanes {
-        Lanes { lo: Vec4::from_array(self.lo), negated: Vec4::from_array(self.negated) }
+    pub fn bounds(&self) -> Bounds {
+        Bounds { lo: Vec4::from_array(self.lo), negated: Vec4::from_array(self.negated) }
     }
     /// Twice the centre.
     #[inline(always)]
-    fn center(&self) -> Vec4 {
-        let Lanes { lo, negated } = self.bounds();
+    pub fn center(&self) -> Vec4 {
+        let Bounds { lo, negated } = self.bounds();
         lo - negated
-    }
-    /// The box of that alone.
-    #[inline(always)]
-    fn centers(&self) -> Lanes {
-        let c = self.center();
-        Lanes { lo: c, negated: -c }
-    }
-}
-
-/// Bounds of some boxes and of their (doubled) centres.
-#[derive(Clone, Copy)]
-pub(super) struct Range {
-    bounds: Lanes,
-    centers: Lanes,
-}
-
-impl Range {
-    pub const EMPTY: Range = Range { bounds: Lanes::EMPTY, centers: Lanes::EMPTY };
-
-    #[inline(always)]
-    pub fn with(self, item: &Item) -> Range {
-        Range { bounds: self.bounds.min(item.bounds()), centers: self.centers.min(item.centers()) }
-    }
-    pub fn and(self, other: &Range) -> Range {
-        Range { bounds: self.bounds.min(other.bounds), centers: self.centers.min(other.centers) }
-    }
-    #[inline(always)]
-    fn of(items: &[Item]) -> Range {
-        items.iter().fold(Range::EMPTY, Range::with)
-    }
-    #[inline(always)]
-    pub fn aabb(&self) -> Aabb {
-        let Lanes { lo, negated } = self.bounds;
-        Aabb { lo: lo.truncate().to_array(), hi: (-negated).truncate().to_array() }
     }
 }
 
 /// Where some boxes were divided: how many are on the left, and both sides' bounds.
-pub(super) type Halves = (usize, Range, Range);
+pub(super) type Halves = (usize, Bounds, Bounds);
 
 /// Divides two boxes or more, where it costs least, and moves those of the left side to the front.
 #[inline(always)]
-pub(super) fn divide(items: &mut [Item], range: &Range) -> Halves {
+pub(super) fn divide(items: &mut [Item]) -> Halves {
     match items.len() {
         2 => halve(items),
         3 => all_ways::<3, 8>(items),
         4 => all_ways::<4, 16>(items),
         ALL_WAYS => all_ways::<5, 32>(items),
         // few boxes do not fill many bins
-        6 => binned::<4>(items, range),
-        7..=40 => binned::<8>(items, range),
-        _ => binned::<16>(items, range),
+        6 => binned::<4>(items),
+        7..=40 => binned::<8>(items),
+        _ => binned::<16>(items),
     }
 }
 
@@ -127,7 +110,7 @@ pub(super) fn divide(items: &mut [Item], range: &Range) -> Halves {
 #[inline(always)]
 pub(super) fn halve(items: &[Item]) -> Halves {
     let (left, right) = items.split_at(items.len() / 2);
-    (left.len(), Range::of(left), Range::of(right))
+    (left.len(), Bounds::of(left), Bounds::of(right))
 }
 
 /// The best of all ways to divide N boxes; `SETS` is 2^N.
@@ -135,7 +118,7 @@ pub(super) fn halve(items: &[Item]) -> Halves {
 fn all_ways<const N: usize, const SETS: usize>(items: &mut [Item]) -> Halves {
     let own: [Item; N] = std::array::from_fn(|i| items[i]);
     // by set of boxes: its bounds, and the work it is worth
-    let mut bounds = [Lanes::EMPTY; SETS];
+    let mut bounds = [Bounds::EMPTY; SETS];
     let mut costs = [0.0; SETS];
     for set in 1..SETS - 1 {
         bounds[set] = bounds[set & (set - 1)].min(own[set.trailing_zeros() as usize].bounds());
@@ -161,8 +144,7 @@ fn all_ways<const N: usize, const SETS: usize>(items: &mut [Item]) -> Halves {
             }
         }
     }
-    let at = best.count_ones() as usize;
-    (at, Range::of(&items[..at]), Range::of(&items[at..]))
+    (best.count_ones() as usize, bounds[best], bounds[SETS - 1 - best])
 }
 
 /// From a doubled centre to its bin on each axis.
@@ -173,9 +155,20 @@ struct Bins<const B: usize> {
 
 impl<const B: usize> Bins<B> {
     #[inline(always)]
-    fn new(range: &Range) -> Self {
-        let Lanes { lo: start, negated } = range.centers;
-        let extent = -(start + negated);
+    fn new(items: &[Item]) -> Self {
+        // least and largest; halves in turn, as each waits for the one before
+        let both = |(least, most): (Vec4, Vec4), item: &Item| {
+            let c = item.center();
+            (least.min(c), most.max(c))
+        };
+        let nothing = (Vec4::INFINITY, Vec4::NEG_INFINITY);
+        let (left, right) = items.split_at(items.len() / 2);
+        let (mut a, mut b) = (nothing, right[left.len()..].iter().fold(nothing, both));
+        for (x, y) in left.iter().zip(right) {
+            (a, b) = (both(a, x), both(b, y));
+        }
+        let start = a.0.min(b.0);
+        let extent = a.1.max(b.1) - start;
         // an axis without extent, or with one too small to divide by, has one bin
         let scale = extent.to_array().map(|x| if x > f32::MIN_POSITIVE * B as f32 { B as f32 / x } else { 0.0 });
         Bins { start, scale: Vec4::from_array(scale) }
@@ -198,10 +191,10 @@ impl<const B: usize> Bins<B> {
 
 /// Divides at the cheapest of B - 1 planes on each axis.
 #[inline(always)]
-fn binned<const B: usize>(items: &mut [Item], range: &Range) -> Halves {
+fn binned<const B: usize>(items: &mut [Item]) -> Halves {
     const { assert!(B.is_power_of_two() && B <= 1 << 16) };
-    let bins = Bins::<B>::new(range);
-    let mut bounds = [[Lanes::EMPTY; B]; 3];
+    let bins = Bins::<B>::new(items);
+    let mut bounds = [[Bounds::EMPTY; B]; 3];
     let mut counts = [[0u32; B]; 3];
     let mut add = |item: &Item| {
         let k = bins.of(item);
@@ -218,55 +211,56 @@ fn binned<const B: usize>(items: &mut [Item], range: &Range) -> Halves {
         add(b);
     }
     second[first.len()..].iter().for_each(add);
-    let mut best: Option<(f32, usize, usize)> = None;
+    let mut best = (f32::INFINITY, 0, 0);
     for axis in 0..3 {
-        let mut right = [(0.0, 0u32); B];
-        let (mut sum, mut count) = (Lanes::EMPTY, 0);
+        // of what lies on both sides of the plane below each bin: numbers and negated extents. Of nothing these are infinite, which makes the cost a NaN
+        let mut numbers = [[0.0; B]; 2];
+        let mut extents = [[[0.0; 4]; B]; 2];
+        let (mut sum, mut count) = (Bounds::EMPTY, 0);
         for i in (1..B).rev() {
             (sum, count) = (sum.min(bounds[axis][i]), count + counts[axis][i]);
-            right[i] = (if count > 0 { sum.half_area() * count as f32 } else { 0.0 }, count);
+            (numbers[1][i], extents[1][i]) = (count as f32, sum.negated_extent().to_array());
         }
-        let (mut sum, mut count) = (Lanes::EMPTY, 0);
+        let (mut sum, mut count) = (Bounds::EMPTY, 0);
         for i in 1..B {
             (sum, count) = (sum.min(bounds[axis][i - 1]), count + counts[axis][i - 1]);
-            if count == 0 || right[i].1 == 0 {
-                continue;
-            }
+            (numbers[0][i], extents[0][i]) = (count as f32, sum.negated_extent().to_array());
+        }
+        let mut costs = [f32::NAN; B];
+        for i in 1..B {
+            let [left, right] = [0, 1].map(|side| half_area(extents[side][i]) * numbers[side][i]);
             // as above
-            let uneven = count.abs_diff(right[i].1) as f32 / items.len() as f32;
-            let cost = (sum.half_area() * count as f32 + right[i].0) * (1.0 + uneven * 1e-6);
-            if best.is_none_or(|(least, _, _)| cost < least) {
-                best = Some((cost, axis, i));
+            let uneven = (numbers[0][i] - numbers[1][i]).abs() / items.len() as f32;
+            costs[i] = (left + right) * (1.0 + uneven * 1e-6);
+        }
+        for i in 1..B {
+            if costs[i] < best.0 {
+                best = (costs[i], axis, i);
             }
         }
     }
+    let (_, axis, plane) = best;
     // all centres in one bin
-    let Some((_, axis, plane)) = best else { return halve(items) };
-    let of = |bins: &[Lanes]| bins.iter().fold(Lanes::EMPTY, |sum, bin| sum.min(*bin));
+    if plane == 0 {
+        return halve(items);
+    }
+    let of = |bins: &[Bounds]| bins.iter().fold(Bounds::EMPTY, |sum, bin| sum.min(*bin));
     let (left, right) = bounds[axis].split_at(plane);
-    let (left, right) = (of(left), of(right));
-    let (at, left_centers, right_centers) = partition(items, |item| bins.is_below(item, axis, plane));
-    (at, Range { bounds: left, centers: left_centers }, Range { bounds: right, centers: right_centers })
+    let at = partition(items, |item| bins.is_below(item, axis, plane));
+    (at, of(left), of(right))
 }
 
-/// Moves the items of the left side to the front: their number, and the bounds of both sides' centres.
+/// Moves the items of the left side to the front: their number.
 #[inline(always)]
-fn partition(items: &mut [Item], is_left: impl Fn(&Item) -> bool) -> (usize, Lanes, Lanes) {
-    // what is added to what is of no account on a side
-    const NO: [f32; 2] = [f32::INFINITY, 0.0];
-    let (mut left_sum, mut right_sum) = (Lanes::EMPTY, Lanes::EMPTY);
+fn partition(items: &mut [Item], is_left: impl Fn(&Item) -> bool) -> usize {
     let mut at = 0;
     for i in 0..items.len() {
-        let item = items[i];
-        let (left, centers) = (usize::from(is_left(&item)), item.centers());
+        let left = is_left(&items[i]);
         // what stands at the end of the left side comes here, or this stays
-        items[i] = items[at];
-        items[at] = item;
-        left_sum = left_sum.min(centers.plus(NO[left]));
-        right_sum = right_sum.min(centers.plus(NO[1 - left]));
-        at += left;
+        items.swap(i, at);
+        at += usize::from(left);
     }
-    (at, left_sum, right_sum)
+    at
 }
 
 #[cfg(test)]
@@ -283,12 +277,11 @@ mod tests {
     }
 
     fn cost(items: &[Item]) -> f32 {
-        Range::of(items).aabb().half_area() * items.len() as f32
+        Bounds::of(items).aabb().half_area() * items.len() as f32
     }
 
-    fn same(a: &Range, b: &Range) -> bool {
-        let corners = |r: &Range| [r.bounds, r.centers].map(|l| (l.lo.truncate(), l.negated.truncate()));
-        corners(a) == corners(b)
+    fn same(a: &Bounds, b: &Bounds) -> bool {
+        (a.lo.truncate(), a.negated.truncate()) == (b.lo.truncate(), b.negated.truncate())
     }
 
     #[test]
@@ -296,7 +289,7 @@ mod tests {
         let mut rng = Rng(3);
         let all = items(&mut rng, 200);
         // most lie outside of the range whose bins these are
-        let bins = Bins::<8>::new(&Range::of(&all[..20]));
+        let bins = Bins::<8>::new(&all[..20]);
         for item in &all {
             for axis in 0..3 {
                 for plane in 1..8 {
@@ -312,19 +305,17 @@ mod tests {
         let mut rng = Rng(1);
         for n in [2, 3, 4, 5, 6, 7, 40, 41, 1000] {
             let mut items = items(&mut rng, n);
-            let range = Range::of(&items);
-            let (at, left, right) = divide(&mut items, &range);
+            let (at, left, right) = divide(&mut items);
             assert!(0 < at && at < n);
-            assert!(same(&left, &Range::of(&items[..at])) && same(&right, &Range::of(&items[at..])));
+            assert!(same(&left, &Bounds::of(&items[..at])) && same(&right, &Bounds::of(&items[at..])));
             let mut numbers: Vec<u32> = items.iter().map(Item::number).collect();
             numbers.sort_unstable();
             assert!(numbers.into_iter().eq((0..n).map(|i| (i * 70_001) as u32)));
         }
         // nothing to choose
         let mut alike = vec![items(&mut rng, 1)[0]; 64];
-        let range = Range::of(&alike);
-        assert_eq!(divide(&mut alike, &range).0, 32);
-        assert_eq!(divide(&mut alike[..5], &range).0, 2);
+        assert_eq!(divide(&mut alike).0, 32);
+        assert_eq!(divide(&mut alike[..5]).0, 2);
     }
 
     /// Of few no way is better, of many no plane between bins by more than its rounding.
@@ -335,8 +326,7 @@ mod tests {
             for _ in 0..50 {
                 let mut all = items(&mut rng, n);
                 let before = all.clone();
-                let range = Range::of(&all);
-                let (at, ..) = divide(&mut all, &range);
+                let (at, ..) = divide(&mut all);
                 let found = cost(&all[..at]) + cost(&all[at..]);
                 for set in 1..(1 << n) - 1 {
                     let side =
@@ -347,8 +337,7 @@ mod tests {
             }
         }
         let mut all = items(&mut rng, 500);
-        let range = Range::of(&all);
-        let bins = Bins::<16>::new(&range);
+        let bins = Bins::<16>::new(&all);
         let mut cheapest = f32::INFINITY;
         for axis in 0..3 {
             for plane in 1..16 {
@@ -358,7 +347,7 @@ mod tests {
                 }
             }
         }
-        let (at, ..) = divide(&mut all, &range);
+        let (at, ..) = divide(&mut all);
         assert!((cost(&all[..at]) + cost(&all[at..]) - cheapest).abs() <= 2e-6 * cheapest);
     }
 }

@@ -17,7 +17,7 @@
 //! multiple of 64, then the subtrees of its inner children in slot order. So references go forward only, and every byte
 //! belongs to one record.
 
-use bytemuck::Zeroable;
+use bytemuck::{Pod, Zeroable};
 
 /// Bytes in a unit of a reference's offset.
 pub(super) const UNIT: usize = 32;
@@ -91,7 +91,7 @@ pub(super) fn write_f32(bytes: &mut [u8], at: usize, value: f32) {
 
 /// An axis-parallel box.
 #[repr(C)]
-#[derive(Clone, Copy, Debug, PartialEq, Zeroable)]
+#[derive(Clone, Copy, Debug, PartialEq, Pod, Zeroable)]
 pub(super) struct Aabb {
     /// Lower corner.
     pub lo: [f32; 3],

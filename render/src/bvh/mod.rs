@@ -4,9 +4,11 @@
 //! [`forest::Forest`] holds the splits that are resident in one task, [`trace::Tracer`] traces rays through it.
 
 mod arena;
+mod below;
 mod binary;
 pub mod block;
 mod boxes;
+mod cells;
 mod check;
 mod collapse;
 mod divide;

@@ -26,6 +26,7 @@ const SHARE: usize = 8;
 /// Boxes by number: those of the triangles, then those of further parts.
 pub(super) struct Parts<'a> {
     triangles: &'a [[[f32; 3]; 3]],
+    bounds: Aabb,
     /// Boxes of the first parts of triangles that were cut, by ascending triangle.
     cut: Vec<(u32, Aabb)>,
     /// Boxes of the other parts, and whose they are.
@@ -35,8 +36,9 @@ pub(super) struct Parts<'a> {
 impl<'a> Parts<'a> {
     /// Of triangles; fails with the place of the first that has a coordinate that is no number or beyond [`MAX_COORDINATE`].
     pub(super) fn new(triangles: &'a [[[f32; 3]; 3]], fork: &dyn Fork) -> Result<Self, usize> {
-        let mut limit = LARGE * areas(triangles, fork)? / triangles.len().max(1) as f64;
-        let mut parts = Parts { triangles, cut: Vec::new(), more: Vec::new() };
+        let (area, bounds) = areas(triangles, fork)?;
+        let mut limit = LARGE * area / triangles.len().max(1) as f64;
+        let mut parts = Parts { triangles, bounds, cut: Vec::new(), more: Vec::new() };
         let mut large = if limit.is_finite() && limit > 0.0 { over(triangles, 0, limit, fork) } else { Vec::new() };
         // there are few triangles of twice the size: this ends soon
         while !parts.fill(&large, limit) {
@@ -94,6 +96,18 @@ impl Boxes for Parts<'_> {
         });
         of_triangles.chain(self.more[more].iter().map(|(_, aabb)| *aabb))
     }
+    fn one(&self, number: usize) -> Aabb {
+        if let Some(at) = number.checked_sub(self.triangles.len()) {
+            return self.more[at].1;
+        }
+        match self.cut.binary_search_by_key(&(number as u32), |(of, _)| *of) {
+            Ok(at) => self.cut[at].1,
+            Err(_) => Aabb::of_triangle(&self.triangles[number]),
+        }
+    }
+    fn bounds(&self) -> Aabb {
+        self.bounds
+    }
 }
 
 /// Triangles that one thread looks at.
@@ -103,23 +117,27 @@ fn half_area(triangle: &[[f32; 3]; 3]) -> f64 {
     f64::from(Aabb::of_triangle(triangle).half_area())
 }
 
-/// Sum of the half areas of all boxes, added up in the same way whoever does it; or the place of the first triangle that is not sound.
-fn areas(triangles: &[[[f32; 3]; 3]], fork: &dyn Fork) -> Result<f64, usize> {
+/// Sum of the half areas of all boxes, added up in the same way whoever does it, and a box around all; or the place of the first triangle that is not
+/// sound.
+fn areas(triangles: &[[[f32; 3]; 3]], fork: &dyn Fork) -> Result<(f64, Aabb), usize> {
     if triangles.len() <= CHUNK {
-        let mut sum = 0.0;
+        let (mut sum, mut bounds) = (0.0, Aabb::EMPTY);
         for (at, triangle) in triangles.iter().enumerate() {
             // a NaN would hide from the box's minima
             if !triangle.as_flattened().iter().all(|x| x.abs() <= MAX_COORDINATE) {
                 return Err(at);
             }
-            sum += half_area(triangle);
+            let aabb = Aabb::of_triangle(triangle);
+            sum += f64::from(aabb.half_area());
+            bounds = bounds.union(&aabb);
         }
-        return Ok(sum);
+        return Ok((sum, bounds));
     }
     let (left, right) = triangles.split_at(triangles.len() / 2);
-    let (mut a, mut b) = (Ok(0.0), Ok(0.0));
+    let (mut a, mut b) = (Err(0), Err(0));
     fork.join(&mut || a = areas(left, fork), &mut || b = areas(right, fork));
-    Ok(a? + b.map_err(|at| left.len() + at)?)
+    let (a, b) = (a?, b.map_err(|at| left.len() + at)?);
+    Ok((a.0 + b.0, a.1.union(&b.1)))
 }
 
 /// Numbers of the triangles, of which these begin with `first`, whose boxes are over the limit.

@@ -4,9 +4,11 @@
 //! the sizes of the subtrees before it, and bounds are minima and maxima, so the tree is the same however the work was
 //! divided. Of equal costs, as regular grids have many, the more even division wins.
 
+use super::below::Below;
 use super::binary::{BinaryNode, BinaryTree};
+use super::cells::{self, Sorted, Upper};
 use super::collapse::leaf_cost;
-use super::divide::{Halves, Item, Range, divide, halve};
+use super::divide::{Bounds, Halves, Item, divide, halve};
 use super::layout::{Aabb, WIDTH};
 use super::{Fork, wide};
 use crate::memory::zeros;
@@ -17,6 +19,10 @@ pub(super) trait Boxes: Sync {
     fn count(&self) -> usize;
     /// Those of some numbers, in order.
     fn of(&self, numbers: std::ops::Range<usize>) -> impl Iterator<Item = Aabb>;
+    /// That of one.
+    fn one(&self, number: usize) -> Aabb;
+    /// A box around all.
+    fn bounds(&self) -> Aabb;
 }
 
 impl Boxes for [Aabb] {
@@ -26,10 +32,18 @@ impl Boxes for [Aabb] {
     fn of(&self, numbers: std::ops::Range<usize>) -> impl Iterator<Item = Aabb> {
         self[numbers].iter().copied()
     }
+    fn one(&self, number: usize) -> Aabb {
+        self[number]
+    }
+    fn bounds(&self) -> Aabb {
+        self.iter().fold(Aabb::EMPTY, |sum, aabb| sum.union(aabb))
+    }
 }
 
 /// Below this many boxes a subtree is built by one thread.
 const FORK_ABOVE: usize = 1 << 14;
+/// Above this many, which no cache holds, the upper part is decided by cells.
+const CELLS_ABOVE: usize = 1 << 20;
 /// From this depth on, ranges are halved: bounds the recursion and the traversal stack.
 const MAX_SAH_DEPTH: usize = 64;
 /// No node lies deeper: 2^31 boxes can be halved 31 times.
@@ -39,128 +53,142 @@ const MAX_DEPTH: usize = MAX_SAH_DEPTH + 31;
 pub(super) fn build<B: Boxes + ?Sized>(boxes: &B, max_leaf: u32, fork: &dyn Fork) -> BinaryTree {
     let count = boxes.count();
     assert!((1..=1 << 31).contains(&count), "1 to 2^31 boxes");
-    let mut items: Vec<Item> = zeros(count);
-    let range = fill(&mut items, boxes, 0, fork);
-    let below = descend(&mut items, range, 0, max_leaf as usize, fork);
-    let mut nodes: Vec<BinaryNode> = zeros(1 + below.len());
-    nodes[0] = BinaryNode { aabb: range.aabb(), child: u32::from(below.len() > 0), count: count as u32 };
-    below.write(&mut nodes[1..], fork);
-    let mut order = zeros(count);
-    numbers(&items, &mut order, fork);
-    BinaryTree::new(nodes, order)
-}
-
-/// Writes the numbers of some boxes.
-fn numbers(items: &[Item], out: &mut [u32], fork: &dyn Fork) {
-    if items.len() <= FORK_ABOVE {
-        return out.iter_mut().zip(items).for_each(|(to, item)| *to = item.number());
+    let (mut items, mut order, top, buckets);
+    if count > CELLS_ABOVE {
+        Sorted { items, top, buckets, places: order } = cells::sort(boxes, 2 * FORK_ABOVE, fork);
+    } else {
+        (items, order, top) = (zeros(count), zeros(count), Upper::Bucket);
+        buckets = vec![(count, fill(&mut items, boxes, 0, fork))];
     }
-    let (left, right) = items.split_at(items.len() / 2);
-    let (a, b) = out.split_at_mut(left.len());
-    fork.join(&mut || numbers(left, a, fork), &mut || numbers(right, b, fork));
+    let builder = Builder { max_leaf: max_leaf as usize, fork };
+    let span = Span { items: &mut items, order: &mut order, first: 0 };
+    let (bounds, below) = builder.upper(span, &top, &buckets, 0);
+    BinaryTree::new(below.in_a_row(node(&bounds, count), bytemuck::cast_vec(items)), order)
 }
 
 /// Writes the boxes from number `first` on: their bounds.
-fn fill<B: Boxes + ?Sized>(items: &mut [Item], boxes: &B, first: usize, fork: &dyn Fork) -> Range {
+fn fill<B: Boxes + ?Sized>(items: &mut [Item], boxes: &B, first: usize, fork: &dyn Fork) -> Bounds {
     if items.len() <= FORK_ABOVE {
-        let mut range = Range::EMPTY;
+        let mut bounds = Bounds::EMPTY;
         let numbers = first..first + items.len();
         for ((item, number), aabb) in items.iter_mut().zip(numbers.clone()).zip(boxes.of(numbers)) {
             *item = Item::new(&aabb, number as u32);
-            range = range.with(item);
+            bounds = bounds.min(item.bounds());
         }
-        return range;
+        return bounds;
     }
     let half = items.len() / 2;
     let (left, right) = items.split_at_mut(half);
-    let (mut a, mut b) = (Range::EMPTY, Range::EMPTY);
+    let (mut a, mut b) = (Bounds::EMPTY, Bounds::EMPTY);
     fork.join(&mut || a = fill(left, boxes, first, fork), &mut || b = fill(right, boxes, first + half, fork));
-    a.and(&b)
+    a.min(b)
 }
 
-/// What is below a node, before it is known where all of it is to be.
-enum Below {
-    /// Of few boxes: as it will be; nothing below a leaf.
-    Nodes(Vec<BinaryNode>),
-    /// The children, and what is below them.
-    Halves(Box<([BinaryNode; 2], [Below; 2])>),
+/// Boxes, and what becomes of them.
+struct Span<'a> {
+    items: &'a mut [Item],
+    /// Their numbers, in the order in which they are left.
+    order: &'a mut [u32],
+    /// The first of their places. Where they were, nodes are then.
+    first: usize,
 }
 
-impl Below {
-    /// How many nodes.
-    fn len(&self) -> usize {
-        match self {
-            Below::Nodes(nodes) => nodes.len(),
-            Below::Halves(halves) => 2 + halves.1.iter().map(Below::len).sum::<usize>(),
+impl<'a> Span<'a> {
+    fn split(self, at: usize) -> (Span<'a>, Span<'a>) {
+        let ((items, others), (order, rest)) = (self.items.split_at_mut(at), self.order.split_at_mut(at));
+        (Span { items, order, first: self.first }, Span { items: others, order: rest, first: self.first + at })
+    }
+}
+
+/// Builds what is below nodes, in parallel.
+struct Builder<'a> {
+    max_leaf: usize,
+    fork: &'a dyn Fork,
+}
+
+impl Builder<'_> {
+    /// What is below a node of the upper part, and the bounds of its boxes.
+    fn upper(&self, span: Span, top: &Upper, buckets: &[(usize, Bounds)], depth: usize) -> (Bounds, Below) {
+        let Upper::Halves(_, halves) = top else {
+            let bounds = buckets[0].1;
+            return (bounds, self.descend(span, bounds, depth));
+        };
+        let (first, second) = buckets.split_at(halves[0].buckets());
+        let (left, right) = span.split(first.iter().map(|bucket| bucket.0).sum());
+        let counts = [left.items.len(), right.items.len()];
+        let [(left, a), (right, b)] = self.both(
+            (left, &|span| self.upper(span, &halves[0], first, depth + 1)),
+            (right, &|span| self.upper(span, &halves[1], second, depth + 1)),
+        );
+        (left.min(right), Below::Halves(Box::new(([node(&left, counts[0]), node(&right, counts[1])], [a, b]))))
+    }
+
+    /// The same below a node of which nothing is known but its bounds.
+    fn descend(&self, span: Span, bounds: Bounds, depth: usize) -> Below {
+        let count = span.items.len();
+        if count <= FORK_ABOVE || depth >= MAX_SAH_DEPTH {
+            let Span { items, order, first } = span;
+            let nodes = Vec::with_capacity(count);
+            let mut subtree = Subtree { nodes, items: &mut *items, bounds, depth, max_leaf: self.max_leaf };
+            wide::subtree(&mut subtree, &());
+            let nodes = subtree.nodes;
+            order.iter_mut().zip(&*items).for_each(|(to, item)| *to = item.number());
+            let places: &mut [BinaryNode] = bytemuck::cast_slice_mut(items);
+            return match places.get_mut(..nodes.len()) {
+                Some(places) => {
+                    places.copy_from_slice(&nodes);
+                    Below::Nodes(first..first + nodes.len())
+                }
+                None => Below::Apart(nodes),
+            };
         }
+        let mut division = Division { items: &mut *span.items, halves: (0, Bounds::EMPTY, Bounds::EMPTY) };
+        wide::divide(&mut division, &());
+        let (at, left_bounds, right_bounds) = division.halves;
+        let (left, right) = span.split(at);
+        let below = self.both(
+            (left, &|span| self.descend(span, left_bounds, depth + 1)),
+            (right, &|span| self.descend(span, right_bounds, depth + 1)),
+        );
+        Below::Halves(Box::new(([node(&left_bounds, at), node(&right_bounds, count - at)], below)))
     }
 
-    /// Moves them to where they are to be.
-    fn write(self, out: &mut [BinaryNode], fork: &dyn Fork) {
-        match self {
-            Below::Nodes(nodes) => out.copy_from_slice(&nodes),
-            Below::Halves(halves) => {
-                let (mut pair, [first, second]) = *halves;
-                let (children, rest) = out.split_at_mut(2);
-                let (below_first, below_second) = rest.split_at_mut(first.len());
-                let far = |below: &[BinaryNode], distance: usize| if below.is_empty() { 0 } else { distance as u32 };
-                pair[0].child = far(below_first, 2);
-                pair[1].child = far(below_second, 1 + below_first.len());
-                children.copy_from_slice(&pair);
-                let (mut first, mut second) = (Some(first), Some(second));
-                fork.join(
-                    &mut || first.take().into_iter().for_each(|below| below.write(below_first, fork)),
-                    &mut || second.take().into_iter().for_each(|below| below.write(below_second, fork)),
-                );
-            }
-        }
+    /// Both halves, in parallel.
+    fn both<'s, T: Send>(
+        &self,
+        left: (Span<'s>, &(dyn Fn(Span<'s>) -> T + Sync)),
+        right: (Span<'s>, &(dyn Fn(Span<'s>) -> T + Sync)),
+    ) -> [T; 2] {
+        let (mut a, mut b) = (None, None);
+        let (mut first, mut second) = (Some(left.0), Some(right.0));
+        self.fork.join(&mut || a = first.take().map(left.1), &mut || b = second.take().map(right.1));
+        [a, b].map(|half| half.expect("both were run"))
     }
-}
-
-/// Builds what is below a node of these items, in parallel.
-fn descend(items: &mut [Item], range: Range, depth: usize, max_leaf: usize, fork: &dyn Fork) -> Below {
-    if items.len() <= FORK_ABOVE || depth >= MAX_SAH_DEPTH {
-        let mut subtree = Subtree { nodes: Vec::with_capacity(items.len()), items, range, depth, max_leaf };
-        wide::subtree(&mut subtree, &());
-        return Below::Nodes(subtree.nodes);
-    }
-    let mut division = Division { items, range, halves: (0, Range::EMPTY, Range::EMPTY) };
-    wide::divide(&mut division, &());
-    let (at, left_range, right_range) = division.halves;
-    let (left, right) = items.split_at_mut(at);
-    let pair = [node(&left_range, left.len()), node(&right_range, right.len())];
-    let mut below = [Below::Nodes(Vec::new()), Below::Nodes(Vec::new())];
-    let [a, b] = &mut below;
-    fork.join(&mut || *a = descend(left, left_range, depth + 1, max_leaf, fork), &mut || {
-        *b = descend(right, right_range, depth + 1, max_leaf, fork)
-    });
-    Below::Halves(Box::new((pair, below)))
 }
 
 /// A node, a leaf so far.
 #[inline(always)]
-fn node(range: &Range, count: usize) -> BinaryNode {
-    BinaryNode { aabb: range.aabb(), child: 0, count: count as u32 }
+fn node(bounds: &Bounds, count: usize) -> BinaryNode {
+    BinaryNode { aabb: bounds.aabb(), child: 0, count: count as u32 }
 }
 
 /// Boxes to be divided, and then their halves.
 pub(super) struct Division<'a> {
     items: &'a mut [Item],
-    range: Range,
     halves: Halves,
 }
 
 impl Division<'_> {
     #[inline(always)]
     pub(super) fn run(&mut self, _: &()) {
-        self.halves = divide(self.items, &self.range);
+        self.halves = divide(self.items);
     }
 }
 
 /// Boxes, and then the nodes below that of all of them.
 pub(super) struct Subtree<'a> {
     items: &'a mut [Item],
-    range: Range,
+    bounds: Bounds,
     nodes: Vec<BinaryNode>,
     /// Of the node of all.
     depth: usize,
@@ -170,7 +198,7 @@ pub(super) struct Subtree<'a> {
 /// A node whose descendants are to be built.
 #[derive(Clone, Copy)]
 struct Pending {
-    range: Range,
+    bounds: Bounds,
     first: usize,
     count: usize,
     /// Where it is among the nodes.
@@ -185,7 +213,7 @@ impl Subtree<'_> {
     #[inline(always)]
     pub(super) fn run(&mut self, _: &()) {
         let count = self.items.len();
-        let mut pending = Pending { range: self.range, first: 0, count, at: ROOT, depth: self.depth };
+        let mut pending = Pending { bounds: self.bounds, first: 0, count, at: ROOT, depth: self.depth };
         // what is to the right of the way from the root to where it is
         let mut stack = [pending; MAX_DEPTH];
         let mut waiting = 0;
@@ -193,15 +221,15 @@ impl Subtree<'_> {
             if pending.count <= self.max_leaf {
                 self.few(pending);
             } else {
-                let Pending { range, first, count, at: parent, depth } = pending;
+                let Pending { first, count, at: parent, depth, .. } = pending;
                 let items = &mut self.items[first..first + count];
-                let (at, left, right) = if depth >= MAX_SAH_DEPTH { halve(items) } else { divide(items, &range) };
+                let (at, left, right) = if depth >= MAX_SAH_DEPTH { halve(items) } else { divide(items) };
                 let pair = self.push(parent, [node(&left, at), node(&right, count - at)]);
                 let depth = depth + 1;
-                stack[waiting] = Pending { range: right, first: first + at, count: count - at, at: pair + 1, depth };
+                stack[waiting] = Pending { bounds: right, first: first + at, count: count - at, at: pair + 1, depth };
                 waiting += usize::from(count - at > 1);
                 if at > 1 {
-                    pending = Pending { range: left, first, count: at, at: pair, depth };
+                    pending = Pending { bounds: left, first, count: at, at: pair, depth };
                     continue;
                 }
             }
@@ -233,13 +261,13 @@ impl Subtree<'_> {
         let mut children = [0; MOST];
         let (mut len, mut i) = (1, 0);
         while i < len {
-            let Pending { range, first, count, depth, .. } = all[i];
+            let Pending { first, count, depth, .. } = all[i];
             if count > 1 {
                 let items = &mut self.items[first..first + count];
-                let (at, left, right) = if depth >= MAX_SAH_DEPTH { halve(items) } else { divide(items, &range) };
+                let (at, left, right) = if depth >= MAX_SAH_DEPTH { halve(items) } else { divide(items) };
                 let depth = depth + 1;
-                all[len] = Pending { range: left, first, count: at, at: 0, depth };
-                all[len + 1] = Pending { range: right, first: first + at, count: count - at, at: 0, depth };
+                all[len] = Pending { bounds: left, first, count: at, at: 0, depth };
+                all[len + 1] = Pending { bounds: right, first: first + at, count: count - at, at: 0, depth };
                 children[i] = len;
                 len += 2;
             }
@@ -248,7 +276,7 @@ impl Subtree<'_> {
         // then from below: what is cheaper as one leaf
         let mut costs = [0.0; MOST];
         for i in (0..len).rev() {
-            costs[i] = leaf_cost(all[i].range.aabb().half_area(), all[i].count as u32);
+            costs[i] = leaf_cost(all[i].bounds.aabb().half_area(), all[i].count as u32);
             let child = children[i];
             if child > 0 {
                 let apart = costs[child] + costs[child + 1];
@@ -263,7 +291,7 @@ impl Subtree<'_> {
             let child = children[i];
             if child > 0 {
                 let [a, b] = [&all[child], &all[child + 1]];
-                let pair = self.push(at, [node(&a.range, a.count), node(&b.range, b.count)]);
+                let pair = self.push(at, [node(&a.bounds, a.count), node(&b.bounds, b.count)]);
                 stack[waiting] = (child + 1, pair + 1);
                 stack[waiting + 1] = (child, pair);
                 waiting += 2;
@@ -301,9 +329,9 @@ mod tests {
         for max_leaf in [1, WIDTH] {
             for n in [1, 2, 8, 9, 300, 5000] {
                 let mut items = vec![Item::new(&Aabb::EMPTY, 0); n];
-                let range = fill(&mut items, &boxes(n)[..], 0, &Serial);
+                let bounds = fill(&mut items, &boxes(n)[..], 0, &Serial);
                 let mut others = items.clone();
-                let subtree = |items| Subtree { items, range, nodes: Vec::new(), depth: 0, max_leaf };
+                let subtree = |items| Subtree { items, bounds, nodes: Vec::new(), depth: 0, max_leaf };
                 let mut plain = subtree(&mut items);
                 plain.run(&());
                 let mut wide = subtree(&mut others);
