@@ -11,6 +11,7 @@ demand driven must read most and the reduced grid least, or the command fails; w
 import argparse
 import csv
 import datetime
+import functools
 import hashlib
 import json
 import shutil
@@ -36,7 +37,7 @@ def slots(nodes: int) -> str:
 
 class Bench:
     def __init__(self, a):
-        self.a, self.rows, self.sums, self.nodes, self.prepared = a, [], {}, [], {}
+        self.a, self.rows, self.sums, self.nodes, self.prepared, self.reports = a, [], {}, [], {}, {}
 
     def scene(self, name: str) -> tuple:
         """Path and flags of a scene."""
@@ -54,32 +55,42 @@ class Bench:
             subprocess.run(command, check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         return [str(ply)]
 
-    def render(self, figure: int, scene: str, strategy: str, nodes: int, frames: int, repeat: int) -> dict:
+    def frame(self, scene: str, strategy: str, nodes: int, seed: int, repeat: int, memory: str) -> dict:
+        """The report of a frame; what several figures show is rendered once."""
+        key = (scene, strategy, nodes, seed, repeat, memory)
+        if key in self.reports:
+            return self.reports[key]
         a = self.a
         out, report = a.work / "paper.exr", a.work / "paper.json"
+        # what was prepared is kept, the picture is made anew
+        store = self.store(scene, strategy)
+        shutil.rmtree(store / "jobs", ignore_errors=True)
         command = [a.rayherd, "render", *self.scene(scene), "--splits", "32", "--size", a.size, "--spp", str(a.spp), "--nodes", str(nodes),
-                   "--slots", slots(nodes), "--replicas", str(min(2, nodes)), "--memory", a.memory_of_sizes if figure == 6 else a.memory, "--strategy", strategy,
-                   "--report", str(report), "-o", str(out)]
-        total = None
+                   "--slots", slots(nodes), "--replicas", str(min(2, nodes)), "--memory", memory, "--strategy", strategy,
+                   "--seed", str(seed), "--store", str(store), "--report", str(report), "-o", str(out)]
+        done = subprocess.run(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+        if done.returncode:
+            raise SystemExit(done.stderr)
+        r = json.loads(report.read_text())
+        digest = hashlib.sha256(out.read_bytes()).hexdigest()
+        if self.sums.setdefault((scene, seed), digest) != digest:
+            raise SystemExit(f"{scene} by {strategy} on {nodes} nodes is another picture")
+        if not r["prepare"]["reused"]:
+            self.prepared[store] = sum(b["bytes"] for b in r["prepare"]["took"]["bytes"] if b["op"] == "write")
+        self.reports[key] = r
+        return r
+
+    def store(self, scene: str, strategy: str) -> Path:
+        return self.a.work / f"store-{scene}-{strategy}"
+
+    def render(self, figure: int, scene: str, strategy: str, nodes: int, frames: int, repeat: int) -> dict:
+        memory = self.a.memory_of_sizes if figure == 6 else self.a.memory
         # the frames of a job read one prepared scene: each begins with the nodes' memories empty, as a job's first round does
-        for seed in range(frames):
-            # what was prepared is kept, the picture is made anew
-            store = a.work / f"store-{scene}-{strategy}"
-            shutil.rmtree(store / "jobs", ignore_errors=True)
-            done = subprocess.run([*command, "--seed", str(seed), "--store", str(store)], stdout=subprocess.DEVNULL, stderr=subprocess.PIPE,
-                                  text=True)
-            if done.returncode:
-                raise SystemExit(done.stderr)
-            r = json.loads(report.read_text())
-            digest = hashlib.sha256(out.read_bytes()).hexdigest()
-            if self.sums.setdefault((scene, seed), digest) != digest:
-                raise SystemExit(f"{scene} by {strategy} on {nodes} nodes is another picture")
-            total = r if total is None else add(total, r)
+        all_frames = [self.frame(scene, strategy, nodes, seed, repeat, memory) for seed in range(frames)]
+        total = functools.reduce(add, all_frames)
         busiest = max(n["busy"] / n["slots"] + n["remote_reads"] / NETWORK for n in total["nodes_detail"])
-        if not total["prepare"]["reused"]:
-            self.prepared[store] = sum(b["bytes"] for b in total["prepare"]["took"]["bytes"] if b["op"] == "write")
         row = dict(zip(FIELDS, [figure, scene, STRATEGIES[strategy], nodes, frames, repeat, total["prepare"]["counts"]["triangles"],
-                                total["prepare"]["counts"]["source_bytes"], self.prepared.get(store, ""), total["scene_passes"], total["remote_ratio"],
+                                total["prepare"]["counts"]["source_bytes"], self.prepared.get(self.store(scene, strategy), ""), total["scene_passes"], total["remote_ratio"],
                                 total["network_bytes"], total["rounds"], total["hops"], sum(n["busy"] for n in total["nodes_detail"]),
                                 busiest]))
         self.rows.append(row)
