@@ -101,6 +101,7 @@ fn copy(bvh: &Bvh2, counts: &[u32], boxes: &[Aabb], from: usize, out: &mut Binar
 
 #[cfg(test)]
 mod tests {
+    use super::super::testing::random_boxes;
     use super::*;
     use crate::testing::Rng;
 
@@ -135,12 +136,7 @@ mod tests {
     fn trees_are_whole_and_the_same_each_time() {
         let mut rng = Rng(1);
         for n in [1, 2, 3, 4, 10, 100, 3000] {
-            let boxes: Vec<Aabb> = (0..n)
-                .map(|_| {
-                    let (p, size) = (rng.vec3(10.0), rng.vec3(2.0).abs());
-                    Aabb { lo: (p - size).to_array(), hi: (p + size).to_array() }
-                })
-                .collect();
+            let boxes = random_boxes(&mut rng, n, 2.0);
             let tree = build(&boxes);
             check(&tree, &boxes);
             assert_eq!(build(&boxes).order, tree.order);

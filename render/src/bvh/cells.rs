@@ -6,10 +6,10 @@
 
 use glam::Vec4;
 
-use super::Fork;
-use super::divide::{Bounds, Item};
+use super::divide::{Bounds, Item, cheapest};
 use super::layout::Aabb;
 use super::sah::Boxes;
+use super::{Fork, join};
 use crate::memory::zeros;
 
 /// Most cells along an axis.
@@ -37,9 +37,9 @@ pub(super) struct Sorted {
 
 /// A node of the upper part.
 pub(super) enum Upper {
-    /// With so many buckets below it, one: the tree goes on as usual.
+    /// A bucket. What is below it is not decided here.
     Bucket,
-    /// Divided, with its number of buckets.
+    /// Divided; with the number of buckets below.
     Halves(usize, Box<[Upper; 2]>),
 }
 
@@ -60,7 +60,7 @@ pub(super) fn sort<B: Boxes + ?Sized>(boxes: &B, enough: usize, fork: &dyn Fork)
     let mut places: Vec<u32> = zeros(count);
     let table = Table::fill(boxes, &grid, &mut places, 0, fork, CHUNK.max(count.div_ceil(TABLES)));
     let mut cells = table.cells(&grid);
-    let mut division = Division { grid: &grid, enough, bucket_of: zeros(grid.cells()), counts: Vec::new() };
+    let mut division = Division { enough, bucket_of: zeros(grid.cells()), counts: Vec::new() };
     let top = division.divide(&mut cells, 0);
     let Division { bucket_of, counts, .. } = division;
     rename(&mut places, &bucket_of, fork);
@@ -126,12 +126,12 @@ impl Table {
         if places.len() > chunk {
             let (left, right) = places.split_at_mut(places.len() / 2);
             let second = first + left.len();
-            let (mut a, mut b) = (None, None);
-            fork.join(&mut || a = Some(Table::fill(boxes, grid, left, first, fork, chunk)), &mut || {
-                b = Some(Table::fill(boxes, grid, right, second, fork, chunk))
-            });
-            let mut sum = a.expect("both were run");
-            sum.add(&b.expect("both were run"));
+            let (mut sum, other) = join(
+                fork,
+                || Table::fill(boxes, grid, left, first, fork, chunk),
+                || Table::fill(boxes, grid, right, second, fork, chunk),
+            );
+            sum.add(&other);
             return sum;
         }
         let mut table = Table { counts: zeros(grid.cells()), bounds: vec![Bounds::EMPTY; grid.cells()] };
@@ -158,35 +158,36 @@ impl Table {
     /// Those that hold something.
     fn cells(&self, grid: &Grid) -> Vec<Cell> {
         let filled = self.counts.iter().zip(&self.bounds).enumerate().filter(|(_, (n, _))| **n > 0);
-        filled.map(|(i, (&count, &bounds))| Cell { at: grid.at(i), count, bounds }).collect()
+        filled.map(|(number, (&count, &bounds))| Cell { number, at: grid.at(number), count, bounds }).collect()
     }
 }
 
 /// A cell with boxes.
 #[derive(Clone, Copy)]
 struct Cell {
+    number: usize,
     at: [usize; 3],
     count: u32,
     bounds: Bounds,
 }
 
 /// The cells on their way into buckets.
-struct Division<'a> {
-    grid: &'a Grid,
+struct Division {
     /// A bucket of so many boxes need not be divided.
     enough: usize,
+    /// By number of the cell.
     bucket_of: Vec<u32>,
+    /// Boxes of each bucket.
     counts: Vec<usize>,
 }
 
-impl Division<'_> {
+impl Division {
     fn divide(&mut self, cells: &mut [Cell], depth: usize) -> Upper {
         let count: usize = cells.iter().map(|c| c.count as usize).sum();
-        let plane = if count <= self.enough || depth >= MAX_DEPTH { None } else { best(cells, count) };
+        let plane = if count <= self.enough || depth >= MAX_DEPTH { None } else { best(cells) };
         let Some((axis, plane)) = plane else {
             for cell in cells {
-                let [x, y, z] = cell.at;
-                self.bucket_of[(z * self.grid.along + y) * self.grid.along + x] = self.counts.len() as u32;
+                self.bucket_of[cell.number] = self.counts.len() as u32;
             }
             self.counts.push(count);
             return Upper::Bucket;
@@ -205,34 +206,18 @@ impl Division<'_> {
 }
 
 /// The axis and the first layer of cells on the right, of least expected work; none if all are in one cell.
-fn best(cells: &[Cell], count: usize) -> Option<(usize, usize)> {
+fn best(cells: &[Cell]) -> Option<(usize, usize)> {
     let mut best: Option<(f32, usize, usize)> = None;
     for axis in 0..3 {
-        let mut layers = [(Bounds::EMPTY, 0usize); ALONG];
+        let (mut bounds, mut counts) = ([Bounds::EMPTY; ALONG], [0; ALONG]);
         for cell in cells {
-            let (bounds, boxes) = &mut layers[cell.at[axis]];
-            (*bounds, *boxes) = (bounds.min(cell.bounds), *boxes + cell.count as usize);
+            let layer = cell.at[axis];
+            bounds[layer] = bounds[layer].min(cell.bounds);
+            counts[layer] += cell.count;
         }
-        let add = |sum: (Bounds, usize), layer: &(Bounds, usize)| (sum.0.min(layer.0), sum.1 + layer.1);
-        let work = |(bounds, boxes): (Bounds, usize)| if boxes > 0 { bounds.half_area() * boxes as f32 } else { 0.0 };
-        let mut right = [(0.0, 0); ALONG];
-        let mut sum = (Bounds::EMPTY, 0);
-        for i in (1..ALONG).rev() {
-            sum = add(sum, &layers[i]);
-            right[i] = (work(sum), sum.1);
-        }
-        sum = (Bounds::EMPTY, 0);
-        for i in 1..ALONG {
-            sum = add(sum, &layers[i - 1]);
-            if sum.1 == 0 || right[i].1 == 0 || layers[i - 1].1 == 0 {
-                continue;
-            }
-            // as in `super::divide`
-            let uneven = sum.1.abs_diff(right[i].1) as f32 / count as f32;
-            let cost = (work(sum) + right[i].0) * (1.0 + uneven * 1e-6);
-            if best.is_none_or(|(least, _, _)| cost < least) {
-                best = Some((cost, axis, i));
-            }
+        let least = best.map_or(f32::INFINITY, |(cost, ..)| cost);
+        if let Some((cost, plane)) = cheapest(&bounds, &counts, least) {
+            best = Some((cost, axis, plane));
         }
     }
     best.map(|(_, axis, plane)| (axis, plane))
@@ -244,7 +229,7 @@ fn rename(places: &mut [u32], bucket_of: &[u32], fork: &dyn Fork) {
         return places.iter_mut().for_each(|place| *place = bucket_of[*place as usize]);
     }
     let (left, right) = places.split_at_mut(places.len() / 2);
-    fork.join(&mut || rename(left, bucket_of, fork), &mut || rename(right, bucket_of, fork));
+    join(fork, || rename(left, bucket_of, fork), || rename(right, bucket_of, fork));
 }
 
 /// Writes the boxes of some buckets, from number `first` on, and their bounds. Each thread looks through all numbers for its own.
@@ -263,13 +248,11 @@ fn place<B: Boxes + ?Sized>(
             before += b.0;
             before
         });
-        // the cut that is nearest to the middle, with a bucket on each side
+        // the last cut before the middle, with a bucket on each side
         let at = ends.position(|end| end >= half).map_or(1, |i| i.max(1)).min(buckets.len() - 1);
         let (left, right) = buckets.split_at_mut(at);
         let (a, b) = items.split_at_mut(left.iter().map(|b| b.0).sum());
-        fork.join(&mut || place(a, left, first, boxes, places, fork), &mut || {
-            place(b, right, first + at, boxes, places, fork)
-        });
+        join(fork, || place(a, left, first, boxes, places, fork), || place(b, right, first + at, boxes, places, fork));
         return;
     }
     let mut next = 0;
@@ -292,16 +275,12 @@ fn place<B: Boxes + ?Sized>(
 #[cfg(test)]
 mod tests {
     use super::super::Serial;
+    use super::super::testing::random_boxes;
     use super::*;
     use crate::testing::Rng;
 
     fn boxes(n: usize) -> Vec<Aabb> {
-        let mut rng = Rng(4);
-        let one = |_| {
-            let (p, size) = (rng.vec3(10.0), rng.vec3(0.2).abs());
-            Aabb { lo: (p - size).to_array(), hi: (p + size).to_array() }
-        };
-        (0..n).map(one).collect()
+        random_boxes(&mut Rng(4), n, 0.2)
     }
 
     /// Each box once, in its bucket, whose boxes lie together by number; bounds are theirs, and no bucket is larger than it needs to be.

@@ -211,43 +211,53 @@ fn binned<const B: usize>(items: &mut [Item]) -> Halves {
         add(b);
     }
     second[first.len()..].iter().for_each(add);
-    let mut best = (f32::INFINITY, 0, 0);
+    let mut best: Option<(f32, usize, usize)> = None;
     for axis in 0..3 {
-        // of what lies on both sides of the plane below each bin: numbers and negated extents. Of nothing these are infinite, which makes the cost a NaN
-        let mut numbers = [[0.0; B]; 2];
-        let mut extents = [[[0.0; 4]; B]; 2];
-        let (mut sum, mut count) = (Bounds::EMPTY, 0);
-        for i in (1..B).rev() {
-            (sum, count) = (sum.min(bounds[axis][i]), count + counts[axis][i]);
-            (numbers[1][i], extents[1][i]) = (count as f32, sum.negated_extent().to_array());
-        }
-        let (mut sum, mut count) = (Bounds::EMPTY, 0);
-        for i in 1..B {
-            (sum, count) = (sum.min(bounds[axis][i - 1]), count + counts[axis][i - 1]);
-            (numbers[0][i], extents[0][i]) = (count as f32, sum.negated_extent().to_array());
-        }
-        let mut costs = [f32::NAN; B];
-        for i in 1..B {
-            let [left, right] = [0, 1].map(|side| half_area(extents[side][i]) * numbers[side][i]);
-            // as above
-            let uneven = (numbers[0][i] - numbers[1][i]).abs() / items.len() as f32;
-            costs[i] = (left + right) * (1.0 + uneven * 1e-6);
-        }
-        for i in 1..B {
-            if costs[i] < best.0 {
-                best = (costs[i], axis, i);
-            }
+        let least = best.map_or(f32::INFINITY, |(cost, ..)| cost);
+        if let Some((cost, plane)) = cheapest(&bounds[axis], &counts[axis], least) {
+            best = Some((cost, axis, plane));
         }
     }
-    let (_, axis, plane) = best;
     // all centres in one bin
-    if plane == 0 {
-        return halve(items);
-    }
+    let Some((_, axis, plane)) = best else { return halve(items) };
     let of = |bins: &[Bounds]| bins.iter().fold(Bounds::EMPTY, |sum, bin| sum.min(*bin));
     let (left, right) = bounds[axis].split_at(plane);
     let at = partition(items, |item| bins.is_below(item, axis, plane));
     (at, of(left), of(right))
+}
+
+/// The cheapest of the planes between B layers, if it costs less than `least`: its cost, and the first layer on its right. Of each layer the bounds and the
+/// number of its boxes.
+#[inline(always)]
+pub(super) fn cheapest<const B: usize>(bounds: &[Bounds; B], counts: &[u32; B], least: f32) -> Option<(f32, usize)> {
+    // of what lies on both sides of the plane below each layer: numbers and negated extents. Of nothing these are infinite, which makes the cost a NaN
+    let mut numbers = [[0.0; B]; 2];
+    let mut extents = [[[0.0; 4]; B]; 2];
+    let (mut sum, mut count) = (Bounds::EMPTY, 0);
+    for i in (1..B).rev() {
+        (sum, count) = (sum.min(bounds[i]), count + counts[i]);
+        (numbers[1][i], extents[1][i]) = (count as f32, sum.negated_extent().to_array());
+    }
+    let all = (count + counts[0]) as f32;
+    let (mut sum, mut count) = (Bounds::EMPTY, 0);
+    for i in 1..B {
+        (sum, count) = (sum.min(bounds[i - 1]), count + counts[i - 1]);
+        (numbers[0][i], extents[0][i]) = (count as f32, sum.negated_extent().to_array());
+    }
+    let mut costs = [f32::NAN; B];
+    for i in 1..B {
+        let [left, right] = [0, 1].map(|side| half_area(extents[side][i]) * numbers[side][i]);
+        // as in `all_ways`
+        let uneven = (numbers[0][i] - numbers[1][i]).abs() / all;
+        costs[i] = (left + right) * (1.0 + uneven * 1e-6);
+    }
+    let mut best = (least, 0);
+    for i in 1..B {
+        if costs[i] < best.0 {
+            best = (costs[i], i);
+        }
+    }
+    (best.1 > 0).then_some(best)
 }
 
 /// Moves the items of the left side to the front: their number.
@@ -265,15 +275,13 @@ fn partition(items: &mut [Item], is_left: impl Fn(&Item) -> bool) -> usize {
 
 #[cfg(test)]
 mod tests {
+    use super::super::testing::random_boxes;
     use super::*;
     use crate::testing::Rng;
 
     fn items(rng: &mut Rng, n: usize) -> Vec<Item> {
-        let one = |i: usize, rng: &mut Rng| {
-            let (p, size) = (rng.vec3(10.0), rng.vec3(2.0).abs());
-            Item::new(&Aabb { lo: (p - size).to_array(), hi: (p + size).to_array() }, (i * 70_001) as u32)
-        };
-        (0..n).map(|i| one(i, rng)).collect()
+        let boxes = random_boxes(rng, n, 2.0);
+        boxes.iter().enumerate().map(|(i, b)| Item::new(b, (i * 70_001) as u32)).collect()
     }
 
     fn cost(items: &[Item]) -> f32 {

@@ -45,6 +45,14 @@ pub trait Fork: Sync {
     fn join(&self, a: &mut (dyn FnMut() + Send), b: &mut (dyn FnMut() + Send));
 }
 
+/// Runs both, and returns what they have found.
+fn join<A: Send, B: Send>(fork: &dyn Fork, a: impl FnOnce() -> A + Send, b: impl FnOnce() -> B + Send) -> (A, B) {
+    let (mut a, mut b) = (Some(a), Some(b));
+    let (mut first, mut second) = (None, None);
+    fork.join(&mut || first = a.take().map(|a| a()), &mut || second = b.take().map(|b| b()));
+    (first.expect("both were run"), second.expect("both were run"))
+}
+
 /// One after the other, on the calling thread.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Serial;

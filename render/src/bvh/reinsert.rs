@@ -270,18 +270,14 @@ fn height(tree: &BinaryTree, node: u32) -> usize {
 
 #[cfg(test)]
 mod tests {
+    use super::super::testing::random_boxes;
     use super::super::{Serial, sah};
     use super::*;
     use crate::testing::Rng;
 
     fn boxes(rng: &mut Rng, n: usize) -> Vec<Aabb> {
-        let one = |i: usize, rng: &mut Rng| {
-            // few are large
-            let size = rng.vec3(if i.is_multiple_of(7) { 5.0 } else { 0.3 }).abs();
-            let p = rng.vec3(10.0);
-            Aabb { lo: (p - size).to_array(), hi: (p + size).to_array() }
-        };
-        (0..n).map(|i| one(i, rng)).collect()
+        // few are large
+        (0..n).flat_map(|i| random_boxes(rng, 1, if i.is_multiple_of(7) { 5.0 } else { 0.3 })).collect()
     }
 
     fn built(boxes: &[Aabb], max_leaf: u32) -> BinaryTree {

@@ -10,7 +10,7 @@ use super::cells::{self, Sorted, Upper};
 use super::collapse::leaf_cost;
 use super::divide::{Bounds, Halves, Item, divide, halve};
 use super::layout::{Aabb, WIDTH};
-use super::{Fork, wide};
+use super::{Fork, join, wide};
 use crate::memory::zeros;
 
 /// What a tree is built over: 1 to 2^31 boxes, not inverted, with finite coordinates whose areas are finite.
@@ -79,8 +79,7 @@ fn fill<B: Boxes + ?Sized>(items: &mut [Item], boxes: &B, first: usize, fork: &d
     }
     let half = items.len() / 2;
     let (left, right) = items.split_at_mut(half);
-    let (mut a, mut b) = (Bounds::EMPTY, Bounds::EMPTY);
-    fork.join(&mut || a = fill(left, boxes, first, fork), &mut || b = fill(right, boxes, first + half, fork));
+    let (a, b) = join(fork, || fill(left, boxes, first, fork), || fill(right, boxes, first + half, fork));
     a.min(b)
 }
 
@@ -116,9 +115,10 @@ impl Builder<'_> {
         let (first, second) = buckets.split_at(halves[0].buckets());
         let (left, right) = span.split(first.iter().map(|bucket| bucket.0).sum());
         let counts = [left.items.len(), right.items.len()];
-        let [(left, a), (right, b)] = self.both(
-            (left, &|span| self.upper(span, &halves[0], first, depth + 1)),
-            (right, &|span| self.upper(span, &halves[1], second, depth + 1)),
+        let ((left, a), (right, b)) = join(
+            self.fork,
+            || self.upper(left, &halves[0], first, depth + 1),
+            || self.upper(right, &halves[1], second, depth + 1),
         );
         (left.min(right), Below::Halves(Box::new(([node(&left, counts[0]), node(&right, counts[1])], [a, b]))))
     }
@@ -146,23 +146,12 @@ impl Builder<'_> {
         wide::divide(&mut division, &());
         let (at, left_bounds, right_bounds) = division.halves;
         let (left, right) = span.split(at);
-        let below = self.both(
-            (left, &|span| self.descend(span, left_bounds, depth + 1)),
-            (right, &|span| self.descend(span, right_bounds, depth + 1)),
+        let (a, b) = join(
+            self.fork,
+            || self.descend(left, left_bounds, depth + 1),
+            || self.descend(right, right_bounds, depth + 1),
         );
-        Below::Halves(Box::new(([node(&left_bounds, at), node(&right_bounds, count - at)], below)))
-    }
-
-    /// Both halves, in parallel.
-    fn both<'s, T: Send>(
-        &self,
-        left: (Span<'s>, &(dyn Fn(Span<'s>) -> T + Sync)),
-        right: (Span<'s>, &(dyn Fn(Span<'s>) -> T + Sync)),
-    ) -> [T; 2] {
-        let (mut a, mut b) = (None, None);
-        let (mut first, mut second) = (Some(left.0), Some(right.0));
-        self.fork.join(&mut || a = first.take().map(left.1), &mut || b = second.take().map(right.1));
-        [a, b].map(|half| half.expect("both were run"))
+        Below::Halves(Box::new(([node(&left_bounds, at), node(&right_bounds, count - at)], [a, b])))
     }
 }
 
@@ -303,16 +292,12 @@ impl Subtree<'_> {
 #[cfg(test)]
 mod tests {
     use super::super::Serial;
+    use super::super::testing::random_boxes;
     use super::*;
     use crate::testing::Rng;
 
     fn boxes(n: usize) -> Vec<Aabb> {
-        let mut rng = Rng(1);
-        let one = |_| {
-            let (p, size) = (rng.vec3(10.0), rng.vec3(0.3).abs());
-            Aabb { lo: (p - size).to_array(), hi: (p + size).to_array() }
-        };
-        (0..n).map(one).collect()
+        random_boxes(&mut Rng(1), n, 0.3)
     }
 
     fn bits(nodes: &[BinaryNode]) -> Vec<[u32; 8]> {

@@ -1,8 +1,10 @@
 //! Helpers of this module's tests: random numbers, soups, brute force.
 
+use super::layout::Aabb;
 use super::trace::Tracer;
 use super::{Forest, Kernel, Serial, Sphere, build_block};
 use crate::ray::{Hit, PrimId, Ray};
+use crate::testing::Rng;
 
 /// xorshift64*.
 pub(super) struct Random(u64);
@@ -31,6 +33,15 @@ impl Random {
     pub fn point(&mut self, size: f32) -> [f32; 3] {
         std::array::from_fn(|_| self.signed() * size)
     }
+}
+
+/// Boxes around points within 10 units along each axis, at most so large to each side.
+pub(super) fn random_boxes(rng: &mut Rng, n: usize, size: f32) -> Vec<Aabb> {
+    let mut one = |_| {
+        let (p, size) = (rng.vec3(10.0), rng.vec3(size).abs());
+        Aabb { lo: (p - size).to_array(), hi: (p + size).to_array() }
+    };
+    (0..n).map(&mut one).collect()
 }
 
 pub(super) type Triangle = [[f32; 3]; 3];
