@@ -1,6 +1,8 @@
 //! Running the built binary.
 #![allow(dead_code, reason = "each test file uses its own part of this")]
 
+pub mod bed;
+
 use std::io::Read;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output, Stdio};
