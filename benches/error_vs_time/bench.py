@@ -2,7 +2,8 @@
 
 Error is relMSE = mean((I - R)^2 / (R^2 + 0.01)) with the reference's own noise subtracted; the reference is Mitsuba's, in two halves, so that its
 noise is known. Time is CPU seconds of a process from its start (all threads), its wall seconds beside it, and the CPU of rendering alone. Each
-renderer is used as it comes; Mitsuba's kernel cache is filled first. Cycles (by_cycles.py) runs with its light tree and without.
+renderer is used as it comes; Mitsuba's kernel cache is filled first. Cycles (by_cycles.py) runs with its light tree and without. Ours runs twice: with
+so many samples a pixel, as the others, and asked for an error (`--target-error`), as who wants one would; its error is measured as the others' is.
 """
 import argparse
 import csv
@@ -30,6 +31,8 @@ QUIET = 0.1
 WORST = {"veach-mis": 16}
 # from which ray on Mitsuba's roulette ends paths where its 5 is not its best: error times CPU from 2, 3, 4, 5 and 8 on was tried on these two (docs/benchmarks/tried.md)
 RR_DEPTH = {"living-room": 2, "staircase": 4}
+# ours when an error is asked for
+ASKED = "rayherd-target"
 # sets of repeats from which an interval is made
 DRAWS = 1000
 SCENES = ["cornell", "gyroid", "staircase", "living-room", "veach-mis", "classroom", *scenes.MANY_LIGHTS, "ajar-door"]
@@ -62,8 +65,16 @@ class Renderer:
     def is_cycles(self) -> bool:
         return self.name.startswith("cycles")
 
-    def render(self, a, name: str, xml: Path, spp: int, seed: int) -> dict:
+    def is_ours(self) -> bool:
+        return self.variant is None
+
+    def settings(self, a, target: float) -> list:
+        """What it is run with: samples a pixel, or errors that are asked for."""
+        return [target * e for e in a.asked] if self.name == ASKED else a.spp
+
+    def render(self, a, name: str, xml: Path, setting, seed: int) -> dict:
         """CPU, wall and CPU without start and loading, and the image."""
+        spp, asked = (a.most_spp, ["--target-error", setting]) if self.name == ASKED else (setting, [])
         out, report = a.work / f"bench-{self.name}.npy", a.work / "bench.json"
         if self.is_cycles():
             told, exr, here = a.work / f"{name}-cycles.npz", a.work / "bench-cycles.exr", Path(__file__).with_name("by_cycles.py")
@@ -72,24 +83,26 @@ class Renderer:
                 run([sys.executable, here, "export", xml, told, *values])
             cpu, wall, text = run([sys.executable, here, "render", told, exr, SIZE, spp, seed, a.max_depth, int(self.variant == "tree")])
             return {"cpu": cpu, "wall": wall, "render": float(text.split()[-1]), "image": read_exr(exr)}
-        if self.variant is None:
+        if self.is_ours():
             exr = a.work / "bench.exr"
             command = [a.rayherd, "render", str(xml), "--size", f"{SIZE}x{SIZE}", "--spp", str(spp), "--seed", str(seed),
-                       "--max-depth", str(a.max_depth), "-o", str(exr), "--report", str(report)]
+                       "--max-depth", str(a.max_depth), "-o", str(exr), "--report", str(report), *asked]
         else:
             values = scenes.parameters(xml, SIZE, a.max_depth)
             command = [sys.executable, "-c", MITSUBA, self.variant, str(scenes.read_by_mitsuba(xml)), str(spp), str(seed), str(out),
                        f"{a.max_depth},{RR_DEPTH.get(name, 0)}"]
             command += [f"{k}={v}" for k, v in values.items()]
         cpu, wall, text = run(command)
-        if self.variant is None:
+        if self.is_ours():
             r = json.loads(report.read_text())
+            if asked and not r["target_reached"]:
+                raise SystemExit(f"{name}: {a.most_spp} samples a pixel do not reach {setting}: give --most-spp more")
             tracing = sum(node["busy"] for node in r["nodes_detail"])
-            return {"cpu": cpu, "wall": wall, "render": tracing, "image": read_exr(exr)}
+            return {"cpu": cpu, "wall": wall, "render": tracing, "spp": round(r["samples"] / SIZE ** 2), "image": read_exr(exr)}
         return {"cpu": cpu, "wall": wall, "render": float(text.split()[-1]), "image": np.load(out).astype(np.float64)}
 
 
-RENDERERS = [Renderer("rayherd", None), Renderer("llvm", "llvm_ad_rgb"), Renderer("scalar", "scalar_rgb")]
+RENDERERS = [Renderer("rayherd", None), Renderer(ASKED, None), Renderer("llvm", "llvm_ad_rgb"), Renderer("scalar", "scalar_rgb")]
 CYCLES = [Renderer("cycles-tree", "tree"), Renderer("cycles", "plain")]
 
 
@@ -109,7 +122,7 @@ def reference(a, name: str, xml: Path, target: float) -> dict:
         r = dict(np.load(path))
         if path == known or noise(r) < QUIET * target:
             return r
-    renderer, sums, counts, spp = RENDERERS[0 if name in OWN_REFERENCE else 1], [0.0, 0.0], [0, 0], 1024
+    renderer, sums, counts, spp = next(r for r in RENDERERS if r.name == ("rayherd" if name in OWN_REFERENCE else "llvm")), [0.0, 0.0], [0, 0], 1024
     for i in range(64):
         sums[i % 2] = sums[i % 2] + renderer.render(a, name, xml, spp, 100_000 + i)["image"]
         counts[i % 2] += 1
@@ -153,10 +166,13 @@ def told(points: list, target: float) -> str:
 
 
 def points(rows: list, key: str, repeats: list | None = None) -> list:
-    """Median time and mean error of each number of samples, of all repeats or of the named ones, each as often as it is named."""
+    """Median time and mean error of each setting, of all repeats or of the named ones, each as often as it is named."""
     rows = rows if repeats is None else [r for k in repeats for r in rows if r["repeat"] == k]
-    spps = sorted({r["spp"] for r in rows})
-    return [(float(np.median([r[key] for r in rows if r["spp"] == s])), float(np.mean([r["rel_mse"] for r in rows if r["spp"] == s]))) for s in spps]
+    settings = {}
+    for r in rows:
+        # an error that is asked for takes other samples in each repeat
+        settings.setdefault(-r["asked"] or r["spp"], []).append(r)
+    return [(float(np.median([r[key] for r in of])), float(np.mean([r["rel_mse"] for r in of]))) for _, of in sorted(settings.items())]
 
 
 def ratio(mine: list, theirs: list, key: str, repeats: list, target: float) -> tuple:
@@ -174,11 +190,15 @@ def compare(rows: list, scene: str, target: float) -> list:
     ratios of `DRAWS` sets of repeats drawn from those that were run (bootstrap): errors are means over repeats, since a rare bright path makes one
     repeat's error say little.
     """
-    mine = [r for r in rows if r["scene"] == scene and r["renderer"] == "rayherd"]
-    repeats = sorted({r["repeat"] for r in mine})
+    by = {}
+    for r in rows:
+        if r["scene"] == scene:
+            by.setdefault(r["renderer"], []).append(r)
+    ours = [r.name for r in RENDERERS if r.is_ours() and r.name in by]
     out = []
-    for peer in dict.fromkeys(r["renderer"] for r in rows if r["scene"] == scene and r["renderer"] != "rayherd"):
-        theirs = [r for r in rows if r["scene"] == scene and r["renderer"] == peer]
+    for name, peer in [(n, p) for n in ours for p in by if p not in ours]:
+        mine, theirs = by[name], by[peer]
+        repeats = sorted({r["repeat"] for r in mine})
         for key in ("cpu_s", "render_cpu_s", "wall_s"):
             value, below = ratio(mine, theirs, key, repeats, target)
             if value is None:
@@ -188,7 +208,7 @@ def compare(rows: list, scene: str, target: float) -> list:
             # a set of repeats that does not bracket the error says nothing but that the bracket is narrow
             known = [r for r, _ in drawn if r is not None]
             low, high = np.percentile(known, [2.5, 97.5])
-            out.append({"scene": scene, "peer": peer, "of": key, "rel_mse": target, "repeats": len(repeats), "below": below, "ratio": round(value, 4),
+            out.append({"scene": scene, "ours": name, "peer": peer, "of": key, "rel_mse": target, "repeats": len(repeats), "below": below, "ratio": round(value, 4),
                         "low": round(float(low), 4), "high": round(float(high), 4), "unbracketed": DRAWS - len(known)})
     return out
 
@@ -248,9 +268,11 @@ def main() -> None:
     p.add_argument("--work", type=Path, required=True)
     p.add_argument("--results", type=Path, required=True)
     p.add_argument("--spp", default="16,64,256,1024", type=lambda s: [int(x) for x in s.split(",")])
+    p.add_argument("--asked", default="2,1,0.5", type=lambda s: [float(x) for x in s.split(",")], help="errors asked of ours, in units of that at which renderers are compared")
+    p.add_argument("--most-spp", type=int, default=65536, help="most samples a pixel where an error is asked for")
     p.add_argument("--repeats", type=int, default=3)
     p.add_argument("--max-depth", type=int, default=8)
-    p.add_argument("--without", action="append", default=[], help="a renderer to leave out: llvm, scalar, cycles-tree or cycles")
+    p.add_argument("--without", action="append", default=[], help=f"a renderer to leave out: {ASKED}, llvm, scalar, cycles-tree or cycles")
     p.add_argument("--cycles", action="store_true", help=f"Cycles too, where it has what the scene has: {', '.join(sorted(FOR_CYCLES))}")
     a = p.parse_args()
     a.work, a.shared = a.work.resolve(), a.shared.resolve()
@@ -265,20 +287,22 @@ def main() -> None:
         if a.cycles and name in FOR_CYCLES:
             renderers += [r for r in CYCLES if r.name not in a.without]
         for r in renderers:
-            r.render(a, name, xml, 1, 0)  # fills kernel and page caches
+            if r.name != ASKED:
+                r.render(a, name, xml, 1, 0)  # fills kernel and page caches
         for repeat in range(a.repeats):
-            for spp in a.spp:
-                for r in renderers:
-                    got = r.render(a, name, xml, spp, 12_345 + 7919 * repeat + spp)
-                    row = {"scene": name, "renderer": r.name, "spp": spp, "repeat": repeat, "cpu_s": round(got["cpu"], 3), "wall_s": round(got["wall"], 3),
-                           "render_cpu_s": round(got["render"], 3), "rel_mse": error(ref, got["image"], WORST.get(name, 0)), "mean": float(got["image"].mean())}
-                    rows.append(row)
-                    print("{scene} {renderer} {spp} spp: {cpu_s:.2f} CPU-s ({render_cpu_s:.2f} without load), relMSE {rel_mse:.3e}".format(**row), flush=True)
+            # settings of all renderers in turn; who has fewer of them is done sooner
+            for k, (r, setting) in sorted(((k, (r, s)) for r in renderers for k, s in enumerate(r.settings(a, target))), key=lambda of: of[0]):
+                got = r.render(a, name, xml, setting, 12_345 + 7919 * repeat + 16 * 4 ** k)
+                row = {"scene": name, "renderer": r.name, "spp": got.get("spp", setting), "asked": setting if r.name == ASKED else 0.0, "repeat": repeat,
+                       "cpu_s": round(got["cpu"], 3), "wall_s": round(got["wall"], 3), "render_cpu_s": round(got["render"], 3),
+                       "rel_mse": error(ref, got["image"], WORST.get(name, 0)), "mean": float(got["image"].mean())}
+                rows.append(row)
+                print("{scene} {renderer} {spp} spp: {cpu_s:.2f} CPU-s ({render_cpu_s:.2f} without load), relMSE {rel_mse:.3e}".format(**row), flush=True)
         for r in renderers:
             mine = [x for x in rows if x["scene"] == name and x["renderer"] == r.name]
             print(f"{name} to relMSE {target}: {r.name} {told(points(mine, 'cpu_s'), target)}")
         for c in compare(rows, name, target):
-            print("{scene}: {of} to relMSE {rel_mse} over {peer}'s: {0}{ratio:.3f} ({low:.3f} to {high:.3f}, {repeats} repeats)".format("below " * c["below"], **c), flush=True)
+            print("{scene}: {ours}, {of} to relMSE {rel_mse} over {peer}'s: {0}{ratio:.3f} ({low:.3f} to {high:.3f}, {repeats} repeats)".format("below " * c["below"], **c), flush=True)
     machine = next((l.split(":")[1].strip() for l in open("/proc/cpuinfo") if l.startswith("model name")), platform.machine())
     # without the marks of trade that some have
     words = re.sub(r"\([^)]*\)", "", machine).split()

@@ -34,6 +34,12 @@ def slots(nodes: int) -> str:
     return ",".join(["2"] * (nodes // 2) + ["4"] * (nodes - nodes // 2))
 
 
+def known(path: Path) -> list:
+    """The rows of a file that this program has written."""
+    words = {"scene", "strategy", "prepare_written"}
+    with open(path, newline="") as f:
+        return [{k: v if k in words else int(v) if v.isdigit() else float(v) for k, v in r.items()} for r in csv.DictReader(f)]
+
 
 class Bench:
     def __init__(self, a):
@@ -144,11 +150,14 @@ def main() -> int:
     p.add_argument("--repeats", type=int, default=3)
     p.add_argument("--memory", default="84MiB", help="per node: four splits of the chest scan")
     p.add_argument("--memory-of-sizes", default="8MiB", help="per node in Fig. 6: the smallest scene fits, the largest is eight times as much")
+    p.add_argument("--more", type=Path, help="a CSV of the same options, whose repeats are kept; these come after them")
     a = p.parse_args()
     a.work.mkdir(parents=True, exist_ok=True)
     bench = Bench(a)
+    bench.rows = known(a.more) if a.more else []
+    first = 1 + max((r["repeat"] for r in bench.rows), default=-1)
     wanted = {int(f) for f in a.figures.split(",")}
-    for repeat in range(a.repeats):
+    for repeat in range(first, first + a.repeats):
         for strategy in STRATEGIES:
             if 4 in wanted:
                 for frames in (1, 4):
@@ -161,7 +170,7 @@ def main() -> int:
                     bench.render(6, scene, strategy, 8, 1, repeat)
             if 7 in wanted:
                 total = bench.render(7, "chest", strategy, 8, 1, repeat)
-                if repeat == 0:
+                if repeat == first:
                     bench.nodes.append((STRATEGIES[strategy], total["nodes_detail"]))
     name = f"{datetime.date.today()}-paper"
     with open(a.results / f"{name}.csv", "w", newline="") as f:
