@@ -3,7 +3,7 @@
 use rayherd_render::path::{PathRay, ShadowRay};
 use rayherd_render::ray::{PrimId, Ray};
 use rayherd_render::skip::{Skip, Skips};
-use rayherd_scene::grid::{Grid, Progress, SplitSet};
+use rayherd_scene::grid::{Grid, Outside, Progress};
 
 /// The nearest hit that a ray found so far.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -45,12 +45,13 @@ impl Visit {
     /// All cells were visited: the candidate is the hit, and the ray goes where its attributes are.
     pub const DECIDED: Visit = Visit { progress: Progress::START, owner: u16::MAX };
 
-    /// Where a ray goes next that was tested against `resident`: the split, and how far it will be then. None when
-    /// nothing outside can be hit at or before `ray.tmax`. `missed` as in [`Grid::next_foreign_counted`].
-    pub fn next(self, grid: &Grid, ray: &Ray, resident: &SplitSet, missed: &mut u64) -> Option<(u32, Visit)> {
+    /// Where a ray goes next that was tested against what is resident: the split, and how far it will be then. None when
+    /// nothing `outside` can be hit at or before `ray.tmax`. `missed` as in [`Grid::next_foreign_counted`].
+    pub fn next(self, grid: &Grid, ray: &Ray, outside: &Outside, missed: &mut u64) -> Option<(u32, Visit)> {
         if self == Visit::DECIDED {
             return None;
         }
+        let resident = outside.resident();
         let foreign = |owners: &[u32], from: usize| {
             owners.iter().enumerate().skip(from).find(|(_, s)| !resident.contains(**s)).map(|(i, &s)| (s, i as u16))
         };
@@ -60,7 +61,7 @@ impl Visit {
         {
             return Some((split, Visit { progress: self.progress, owner }));
         }
-        let cell = grid.next_foreign_counted(ray, self.progress, resident, missed)?;
+        let cell = grid.next_foreign_counted(ray, self.progress, outside, missed)?;
         let (split, owner) = foreign(cell.owners, 0)?;
         Some((split, Visit { progress: cell.progress, owner }))
     }

@@ -8,7 +8,6 @@ use rayherd_render::film::{BoundedFilm, FilmPart, Layout};
 use rayherd_render::frame::Frame;
 use rayherd_render::path::{Context, PathRay};
 use rayherd_render::skip::{Skip, SkipCounts};
-use rayherd_scene::grid::SplitSet;
 use serde::{Deserialize, Serialize};
 
 use super::nodes::{NodeBlocks, Nodes};
@@ -365,7 +364,7 @@ impl<'a> Task<'a, '_> {
                     }
                     t.trace.count_camera(made.len() as u64, &context);
                     for &ray in &made {
-                        match t.trace.next(Visit::START, grid, &ray.ray(), &SplitSet::default()) {
+                        match t.trace.next(Visit::START, grid, &ray.ray(), grid.everywhere()) {
                             Some((to, visit)) => queues.path(to, PathFlight { visit, ..PathFlight::new(ray) })?,
                             None => t.trace.miss(&context, ray, t.film),
                         }
@@ -388,7 +387,7 @@ impl<'a> Task<'a, '_> {
         let (shared, node, stop) = (self.shared, self.attempt.node, self.stop);
         let (context, grid) = (shared.context(self.textures), &shared.scene.grid);
         let together = grid.sharing(split);
-        let set: SplitSet = together.iter().copied().collect();
+        let outside = grid.outside(&together.iter().copied().collect());
         let limit = self.many();
         self.inputs(limit, |t, mut flights| {
             loop {
@@ -424,13 +423,13 @@ impl<'a> Task<'a, '_> {
                 let mut brought = 0;
                 t.trace.clock.start();
                 for flight in flights.paths.drain(..) {
-                    let next = t.trace.next(flight.visit, grid, &flight.bounded(context.skips), &set);
+                    let next = t.trace.next(flight.visit, grid, &flight.bounded(context.skips), &outside);
                     let visit = next.map_or(Visit::DECIDED, |n| n.1);
                     let bucket = flight.ray.key.pixel % shared.buckets;
                     groups.add_path(Destination::Reduce(bucket), PathFlight { visit, ..flight })?;
                 }
                 for flight in flights.shadows.drain(..) {
-                    match t.trace.next(flight.visit, grid, &flight.ray.ray(), &set) {
+                    match t.trace.next(flight.visit, grid, &flight.ray.ray(), &outside) {
                         Some((to, visit)) => groups.shadow(to, ShadowFlight { visit, ..flight })?,
                         None => {
                             let light = flight.ray.light();

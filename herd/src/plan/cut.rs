@@ -7,7 +7,7 @@
 
 use std::cmp::Reverse;
 
-use super::cost::RAY;
+use super::cost::{RAY, WALK};
 use super::{View, Window, auto};
 
 /// The cut to work with from now on: windows that cover the scene, at most one for each node, none larger than what a node can
@@ -159,11 +159,12 @@ pub(super) fn cost(view: &View, cut: &[Window]) -> f64 {
     load + ways(view, cut) + idle * RAY as f64
 }
 
-/// Bytes moved by rays on their way between the windows of a cut.
+/// What rays on their way between the windows of a cut cost, and finding out which of them have to go.
 fn ways(view: &View, cut: &[Window]) -> f64 {
     let waiting: u64 = view.waiting.values().flatten().map(|g| g.rays).sum();
     let camera: u64 = view.camera.values().sum();
     let rays = waiting as f64 + camera as f64 * view.traffic.rays_per_camera();
     let hops = rays * view.traffic.hops_per_ray(parts(view.splits.iter().map(|s| s.bytes), cut));
-    hops * view.traffic.hop(view.replicas)
+    let asked = if cut.len() > 1 { rays } else { 0.0 };
+    hops * view.traffic.hop(view.replicas) + asked * WALK as f64
 }

@@ -8,7 +8,7 @@ use rayherd_render::film::BoundedFilm;
 use rayherd_render::path::{Context, Outcome, PathRay, Surface, Surfaces, shade, shade_traced, take_aovs};
 use rayherd_render::ray::{Hit, MISS, PrimId, Ray};
 use rayherd_render::skip::{Skip, SkipCounts, Skips};
-use rayherd_scene::grid::{Grid, SplitSet};
+use rayherd_scene::grid::{Grid, Outside};
 
 use super::CameraFeed;
 use crate::flight::{Candidate, Flights, PathFlight, ShadowFlight, Visit};
@@ -199,6 +199,7 @@ impl Loop {
         outbox: &mut dyn Outbox,
         stop: &dyn Stop,
     ) -> Result<(), JobError> {
+        let outside = grid.outside(resident.splits());
         let mut current: Vec<PathFlight> = Vec::new();
         let mut made: Vec<PathRay> = Vec::new();
         let (mut ready, mut ready_hits): (Vec<PathRay>, Vec<Hit>) = Default::default();
@@ -207,7 +208,7 @@ impl Loop {
             while flights.shadows.len() >= self.batch || (flights.paths.is_empty() && !flights.shadows.is_empty()) {
                 let from = flights.shadows.len().saturating_sub(self.batch);
                 let batch: Vec<ShadowFlight> = flights.shadows.drain(from..).collect();
-                self.shadows(grid, resident, &batch, film, outbox)?;
+                self.shadows(grid, &outside, resident, &batch, film, outbox)?;
             }
             let from = flights.paths.len().saturating_sub(self.batch);
             current.clear();
@@ -228,7 +229,7 @@ impl Loop {
             ready_hits.clear();
             for (flight, hit) in current.iter().zip(&self.hits) {
                 let ray = flight.bounded(self.skips);
-                if let Some((to, visit)) = flight.visit.next(grid, &ray, resident.splits(), &mut self.cells) {
+                if let Some((to, visit)) = flight.visit.next(grid, &ray, &outside, &mut self.cells) {
                     outbox.path(to, PathFlight { visit, ..*flight })?;
                 } else if flight.candidate.is_hit() && !hit.is_hit() {
                     if flight.visit == Visit::DECIDED {
@@ -301,9 +302,10 @@ impl Loop {
     }
 
     /// Traces shadow rays: those that pass go on, or bring their light.
-    pub fn shadows(
+    fn shadows(
         &mut self,
         grid: &Grid,
+        outside: &Outside,
         resident: &Resident,
         batch: &[ShadowFlight],
         film: &mut BoundedFilm,
@@ -320,7 +322,7 @@ impl Loop {
             if self.occluded[i] {
                 continue;
             }
-            if let Some((to, visit)) = flight.visit.next(grid, &self.rays_in[i], resident.splits(), &mut self.cells) {
+            if let Some((to, visit)) = flight.visit.next(grid, &self.rays_in[i], outside, &mut self.cells) {
                 outbox.shadow(to, ShadowFlight { visit, ..*flight })?;
             } else {
                 let light = flight.ray.light();
@@ -388,8 +390,8 @@ impl Loop {
     }
 
     /// Where a ray goes next; see [`Visit::next`].
-    pub fn next(&mut self, visit: Visit, grid: &Grid, ray: &Ray, resident: &SplitSet) -> Option<(u32, Visit)> {
-        visit.next(grid, ray, resident, &mut self.cells)
+    pub fn next(&mut self, visit: Visit, grid: &Grid, ray: &Ray, outside: &Outside) -> Option<(u32, Visit)> {
+        visit.next(grid, ray, outside, &mut self.cells)
     }
 }
 

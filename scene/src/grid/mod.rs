@@ -4,8 +4,10 @@
 //! the splits that hold its primitives (its *owners*) and the tight box of what is inside it. A ray that may still
 //! hit something outside the resident splits finds out here where to go ([`Grid::next_foreign`]).
 
+mod boxes;
 pub mod count;
 pub mod lattice;
+mod outside;
 mod splitset;
 #[cfg(test)]
 mod tests;
@@ -16,6 +18,7 @@ use serde::{Deserialize, Serialize};
 
 pub use count::{Candidate, StoppedBy};
 pub use lattice::{Lattice, MAX_SUBDIV};
+pub use outside::Outside;
 pub use splitset::SplitSet;
 pub use walk::{Foreign, Progress};
 
@@ -74,6 +77,8 @@ pub struct Grid {
     /// Cell number by lattice index, [`EMPTY`] where there is none.
     dense: Vec<u32>,
     owning: SplitSet,
+    /// All occupied cells.
+    everywhere: Outside,
     /// Whether cells' boxes are those of what is inside.
     tight: bool,
 }
@@ -135,7 +140,9 @@ impl Grid {
         if owners.len() > u32::MAX as usize {
             return refuse("too many owners".to_owned());
         }
-        Ok(Grid { lattice, cells, owners, dense, owning, tight: true })
+        let mut grid = Grid { lattice, cells, owners, dense, owning, everywhere: Outside::default(), tight: true };
+        grid.everywhere = grid.outside(&SplitSet::default());
+        Ok(grid)
     }
 
     /// The same with all of each occupied cell for its box: to see what tight boxes save. Rays that are on their way through the one cannot go on
@@ -147,6 +154,7 @@ impl Grid {
             }
         }
         self.tight = false;
+        self.everywhere = self.outside(&SplitSet::default());
         self
     }
 
@@ -173,6 +181,11 @@ impl Grid {
     /// The splits that own a cell: after overlap reduction some source splits own none.
     pub fn owning(&self) -> &SplitSet {
         &self.owning
+    }
+
+    /// What is outside of nothing: every occupied cell.
+    pub fn everywhere(&self) -> &Outside {
+        &self.everywhere
     }
 
     /// Whether no ray can ever need another split: every owner is resident. Ask once per resident set, and skip the

@@ -19,7 +19,8 @@
 
 use rayherd_render::ray::Ray;
 
-use super::{Cell, EMPTY, Grid, SplitSet};
+use super::boxes::Quick;
+use super::{Grid, Outside, SplitSet};
 
 /// How far a ray has come on its way through the grid: the last cell it was sent to. Opaque, fits a wire record.
 #[repr(transparent)]
@@ -53,11 +54,11 @@ const BEYOND: f64 = 1e300;
 /// A ray in f64 with what every box test needs.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct WalkRay {
-    o: [f64; 3],
-    d: [f64; 3],
+    pub(super) o: [f64; 3],
+    pub(super) d: [f64; 3],
     inverse: [f64; 3],
-    pad: f64,
-    tmin: f64,
+    pub(super) pad: f64,
+    pub(super) tmin: f64,
     tmax: f64,
 }
 
@@ -104,24 +105,42 @@ impl WalkRay {
 
 impl Grid {
     /// The next cell after `from` in which `ray` can hit something at or before `ray.tmax` and that has an owner
-    /// outside `resident`; `None` when there is none: then the best candidate so far is the nearest hit of all.
+    /// that is not resident; `None` when there is none: then the best candidate so far is the nearest hit of all.
     ///
     /// A progress that names no cell counts as [`Progress::START`] (nothing is missed). A ray with NaN, or without a
     /// direction, hits nothing.
-    pub fn next_foreign(&self, ray: &Ray, from: Progress, resident: &SplitSet) -> Option<Foreign<'_>> {
-        self.next_foreign_counted(ray, from, resident, &mut 0)
+    pub fn next_foreign(&self, ray: &Ray, from: Progress, outside: &Outside) -> Option<Foreign<'_>> {
+        self.next_foreign_counted(ray, from, outside, &mut 0)
     }
 
-    /// The same; adds to `missed` the cells on its way that hold something outside `resident` and whose tight boxes the ray misses.
+    /// The same; adds to `missed` the cells on its way that hold something that is not resident and whose tight boxes the ray misses.
     pub fn next_foreign_counted(
         &self,
         ray: &Ray,
         from: Progress,
-        resident: &SplitSet,
+        outside: &Outside,
         missed: &mut u64,
     ) -> Option<Foreign<'_>> {
         let lattice = self.lattice();
-        let walk = WalkRay::new(ray, lattice.magnitude())?;
+        let walk = WalkRay::new(ray, lattice.magnitude()).filter(|_| !outside.is_empty())?;
+        if let Some(boxes) = &outside.boxes
+            && let Some(quick) = Quick::new(&walk)
+        {
+            let last_key = self.key_of(from, &walk);
+            let mut best: Option<(f64, u32)> = None;
+            let passed = boxes.visit(&quick, walk.tmax, |number| {
+                let cell = &self.cells[number as usize];
+                if let Some(t) = walk.enter(&cell.lo, &cell.hi) {
+                    let key = (t, number);
+                    if t <= walk.tmax && last_key.is_none_or(|l| key > l) && best.is_none_or(|b| key < b) {
+                        best = Some(key);
+                    }
+                }
+                best.map_or(walk.tmax, |(t, _)| t)
+            });
+            *missed += if self.tight { passed } else { 0 };
+            return best.map(|(t, number)| self.foreign(t, number));
+        }
         // the axis that crosses most cells: along it a slab holds few cells of the ray
         let crossed = |a: usize| if lattice.count(a) > 1 { walk.d[a].abs() / lattice.width(a) } else { 0.0 };
         let mut major = 0;
@@ -133,12 +152,14 @@ impl Grid {
 
         // cells are widened by twice the pad of boxes, so that a box that passes its test lies in a visited cell
         let wide = 2.0 * walk.pad;
-        let (box_lo, box_hi) = lattice.bounds();
         let (mut begin, mut end) = (walk.tmin, walk.tmax);
         for a in 0..3 {
-            let (n, f) = walk.slab(a, box_lo[a], box_hi[a], wide);
+            let (n, f) = walk.slab(a, f64::from(outside.lo[a]), f64::from(outside.hi[a]), wide);
             begin = begin.max(n);
             end = end.min(f);
+        }
+        if begin > end {
+            return None;
         }
         let last_key = self.key_of(from, &walk);
         if let Some((t, _)) = last_key {
@@ -167,14 +188,12 @@ impl Grid {
                     for y in y0..=y1 {
                         let mut at = [0; 3];
                         (at[major], at[minor], at[other]) = (k, y, z);
-                        let number = self.dense[lattice.index(at) as usize];
-                        if number == EMPTY {
+                        let index = lattice.index(at);
+                        if !outside.has(index) {
                             continue;
                         }
+                        let number = self.dense[index as usize];
                         let cell = &self.cells[number as usize];
-                        if !self.is_foreign(cell, resident) {
-                            continue;
-                        }
                         let Some(t) = walk.enter(&cell.lo, &cell.hi) else {
                             *missed += u64::from(self.tight);
                             continue;
@@ -203,7 +222,7 @@ impl Grid {
 
     /// The first occupied cell in which `ray` can hit something, whatever is resident.
     pub fn first_cell(&self, ray: &Ray) -> Option<Foreign<'_>> {
-        self.next_foreign(ray, Progress::START, &SplitSet::default())
+        self.next_foreign(ray, Progress::START, &self.everywhere)
     }
 
     /// The walk's plain twin: every cell is tested. For tests, and for whoever doubts the walk.
@@ -214,7 +233,7 @@ impl Grid {
         for (number, cell) in (0..).zip(&self.cells) {
             let Some(t) = walk.enter(&cell.lo, &cell.hi) else { continue };
             let key = (t, number);
-            let wanted = t <= walk.tmax && self.is_foreign(cell, resident);
+            let wanted = t <= walk.tmax && self.owners_of(cell).iter().any(|&s| !resident.contains(s));
             if wanted && last_key.is_none_or(|l| key > l) && best.is_none_or(|b| key < b) {
                 best = Some(key);
             }
@@ -231,11 +250,6 @@ impl Grid {
         let number = from.0.checked_sub(1)?;
         let cell = self.cells.get(number as usize)?;
         Some((walk.enter(&cell.lo, &cell.hi)?, number))
-    }
-
-    #[inline]
-    fn is_foreign(&self, cell: &Cell, resident: &SplitSet) -> bool {
-        self.owners_of(cell).iter().any(|&s| !resident.contains(s))
     }
 
     /// Cells of an axis that the widened ray touches between two parameters.

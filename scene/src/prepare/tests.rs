@@ -521,7 +521,7 @@ fn routing_finds_the_nearest_hit_of_the_whole_scene() {
             let mut best: Option<(f32, u64)> = None;
             let mut from = Progress::START;
             let mut resident = SplitSet::default();
-            while let Some(next) = grid.next_foreign(&ray, from, &resident) {
+            while let Some(next) = grid.next_foreign(&ray, from, &grid.outside(&resident)) {
                 from = next.progress;
                 resident = next.owners.iter().copied().collect();
                 visits += 1;

@@ -6,7 +6,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use proptest::prelude::*;
 use rayherd_api::Strategy as Way;
 
-use super::super::cost::{RAY, REMOTE};
+use super::super::cost::{RAY, REMOTE, WALK};
 use super::super::{Assignment, NodeView, Set, View, Waiting, Window, cut, free_slots, grid, plan};
 use super::{Case, case};
 
@@ -222,7 +222,9 @@ fn naive_cost(view: &View, cut: &[Window], half: f64) -> f64 {
     let splits: Vec<u32> = (0..view.splits.len() as u32).collect();
     let rays: f64 = splits.iter().map(|&s| h.work(s)).sum();
     let parts = cut::parts(view.splits.iter().map(|s| s.bytes), cut);
-    load as f64 + rays * view.traffic.hops_per_ray(parts) * view.traffic.hop(view.replicas) + idle * RAY as f64
+    let asked = if cut.len() > 1 { rays } else { 0.0 };
+    let ways = rays * view.traffic.hops_per_ray(parts) * view.traffic.hop(view.replicas) + asked * WALK as f64;
+    load as f64 + ways + idle * RAY as f64
 }
 
 /// The plan, by its rules.
