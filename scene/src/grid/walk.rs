@@ -113,7 +113,8 @@ impl Grid {
         self.next_foreign_counted(ray, from, outside, &mut 0)
     }
 
-    /// The same; adds to `missed` the cells on its way that hold something that is not resident and whose tight boxes the ray misses.
+    /// The same; adds to `missed` the cells with an owner that is not resident that it came near and whose tight boxes the ray misses: those on its way
+    /// from plane to plane, or those of the eights of neighbours that it entered.
     pub fn next_foreign_counted(
         &self,
         ray: &Ray,
